@@ -313,7 +313,7 @@ def evaluating(
         fields=trace.fields_of,
         unseen=decode_unseen(trace.result),
     )
-    held = [_property(trace, job, index, names) for index in range(len(job.checks))]
+    held = [property_of(job, index, trace.start_ns, names) for index in range(len(job.checks))]
     properties = [one for one in held if one is not None]
     places = [
         locate(job, ("checks", index, job.checks[index].kind))
@@ -372,24 +372,29 @@ def _with_topics(topics: set[str] | None, spec: CheckSpec) -> set[str] | None:
     return topics
 
 
-def _property(trace: Trace, job: Job, index: int, names: RunNames) -> RunProperty | None:
-    """Return what a check of a job says, ready to be told of events; None for a function, or a
-    latency."""
+def property_of(
+    job: Job, index: int, start_ns: int, names: RunNames = _NO_NAMES
+) -> RunProperty | None:
+    """Return what a check of a job says, ready to be told of events of a run that began at a time;
+    None for a function, or a latency.
+
+    :raises JobError: it names what is not in the run, or cannot be understood.
+    """
     spec = job.checks[index]
     _wrong_names(job, index, spec, names)
     if spec.function is not None or spec.latency is not None:
         return None
     if spec.rate is not None:
         return RateProperty(
-            spec.rate, spec.at_least, spec.at_most, spec.over_ns or NS_PER_S, trace.start_ns
+            spec.rate, spec.at_least, spec.at_most, spec.over_ns or NS_PER_S, start_ns
         )
     what, after = _conditions(job, index, spec, names)
     assert what is not None
-    start = StartOfTrace(trace.start_ns)
+    start = StartOfTrace(start_ns)
     armed = what.arm(start)
     armed_after: ActiveCondition | None = after.arm(start) if after is not None else None
     if spec.eventually is not None:
-        return EventuallyProperty(armed, armed_after, spec.within_ns, trace.start_ns)
+        return EventuallyProperty(armed, armed_after, spec.within_ns, start_ns)
     text = spec.always or spec.never or ""
     topic = topic_of(with_topic_prefix(text))
     says = f"not {text}" if spec.always is not None else text if topic is not None else ""
@@ -397,7 +402,7 @@ def _property(trace: Trace, job: Job, index: int, names: RunNames) -> RunPropert
         armed,
         armed_after,
         spec.within_ns,
-        trace.start_ns,
+        start_ns,
         says=says,
         topic=topic,
         value=compared(text),

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from rsltrace.conditions.condition import ActiveCondition, error_text, shown
 from rsltrace.conditions.expressions import Expression
-from rsltrace.conditions.trace_events import TraceEvent
+from rsltrace.conditions.view import EventView
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds
@@ -41,8 +41,12 @@ class RunProperty(ABC):
     note: str = field(default="", init=False)
 
     @abstractmethod
-    def see(self, event: TraceEvent) -> None:
+    def see(self, event: EventView) -> None:
         """Take note of an event that has ended."""
+
+    @abstractmethod
+    def advance(self, now_ns: int) -> None:
+        """Judge what can be judged at a time, up to which all events have come."""
 
     @abstractmethod
     def end(self, stamp_ns: int, *, complete: bool) -> None:
@@ -73,11 +77,11 @@ class NeverProperty(RunProperty):
         if self.after is None:
             self._since = (-1, self.start_ns)
 
-    def see(self, event: TraceEvent) -> None:
+    def see(self, event: EventView) -> None:
         """See whether it happens, while it counts."""
         if self._counts(event) and (why := self.what.after(event)):
             since = ""
-            if self.after is not None and self._since is not None:
+            if self._since is not None and self._since[0] >= 0:
                 since = f", after event {self._since[0]}"
             said = f"{self.says or why}{self._values(event)}{since}"
             self._violated(event.index, event.stamp_ns, said)
@@ -85,10 +89,13 @@ class NeverProperty(RunProperty):
         if self.after is not None and self.after.after(event):
             self._since = (event.index, event.stamp_ns)
 
+    def advance(self, now_ns: int) -> None:
+        """Nothing: an event is judged at once."""
+
     def end(self, stamp_ns: int, *, complete: bool) -> None:
         """Nothing: what has not happened by then has not happened."""
 
-    def _values(self, event: TraceEvent) -> str:
+    def _values(self, event: EventView) -> str:
         """Return what was compared, of the messages that the event has sent: `` (x = 0.31)``."""
         if self.value is None or self.count >= KEPT_MAX:
             return ""
@@ -104,7 +111,7 @@ class NeverProperty(RunProperty):
         named = self.value.text.removeprefix("msg.")
         return f" ({named} = {', '.join(values[:_SHOWN_MAX])})" if values else ""
 
-    def _counts(self, event: TraceEvent) -> bool:
+    def _counts(self, event: EventView) -> bool:
         if self._since is None:
             return False
         return self.within_ns is None or event.stamp_ns <= self._since[1] + self.within_ns
@@ -124,9 +131,9 @@ class EventuallyProperty(RunProperty):
         if self.after is None:
             self._waiting.append((None, self.start_ns))
 
-    def see(self, event: TraceEvent) -> None:
+    def see(self, event: EventView) -> None:
         """See what is too late, what happens, and what has to happen from now on."""
-        self._pass(event.stamp_ns - 1)
+        self.advance(event.stamp_ns - 1)
         if self.after is not None and self.after.after(event):
             self._waiting.append((event.index, event.stamp_ns))
         if self._waiting and self.what.after(event):
@@ -135,14 +142,14 @@ class EventuallyProperty(RunProperty):
 
     def end(self, stamp_ns: int, *, complete: bool) -> None:
         """See what is too late, and what had no time left."""
-        self._pass(stamp_ns if complete else stamp_ns - 1)
+        self.advance(stamp_ns if complete else stamp_ns - 1)
         for index, begin_ns in self._waiting:
             if complete and self.within_ns is None:
                 self._missed(index, begin_ns, "before the end of the run")
             else:
                 self.undecided += 1
 
-    def _pass(self, now_ns: int) -> None:
+    def advance(self, now_ns: int) -> None:
         """Give up what should have happened by ``now_ns``."""
         if self.within_ns is None:
             return
@@ -151,7 +158,7 @@ class EventuallyProperty(RunProperty):
             self._missed(index, begin_ns, f"within {format_duration(self.within_ns)}")
 
     def _missed(self, index: int | None, begin_ns: int, when: str) -> None:
-        since = "" if index is None else f" of event {index}"
+        since = "" if index is None or index < 0 else f" of event {index}"
         self._violated(index, begin_ns, f"it does not happen {when}{since}")
 
 
@@ -167,19 +174,27 @@ class RateProperty(RunProperty):
 
     def __post_init__(self) -> None:
         self._sent: list[tuple[int, int]] = []
+        self._has_judged = False
 
-    def see(self, event: TraceEvent) -> None:
+    def see(self, event: EventView) -> None:
         for sent in event.sent():
             if sent.kind == OutputKind.MESSAGE and sent.name == self.topic:
                 self._sent.append((event.stamp_ns, event.index))
 
     def end(self, stamp_ns: int, *, complete: bool) -> None:
         """Count, in the stretches that begin right after each message."""
-        if not self._sent:
+        if not (self._sent or self._has_judged):
             self._silent(stamp_ns, complete=complete)
             return
+        self.advance(stamp_ns)
+        if not self._has_judged:
+            self.undecided += 1
+            self.note = f"less than {format_duration(self.over_ns)} is left after its first message"
+
+    def advance(self, now_ns: int) -> None:
+        """Judge the stretches that have ended, and forget them."""
         stretches = 0
-        for begin_ns, index, count in self._stretches(stamp_ns):
+        for begin_ns, index, count in self._stretches(now_ns):
             stretches += 1
             hz = count * NS_PER_S / self.over_ns
             until = format_seconds(begin_ns + self.over_ns - self.start_ns)
@@ -188,9 +203,8 @@ class RateProperty(RunProperty):
                 self._violated(index, begin_ns, f"{said}, at least {self.at_least:g} Hz")
             elif self.at_most is not None and count > self._most:
                 self._violated(index, begin_ns, f"{said}, at most {self.at_most:g} Hz")
-        if not stretches:
-            self.undecided += 1
-            self.note = f"less than {format_duration(self.over_ns)} is left after its first message"
+        self._has_judged |= stretches > 0
+        del self._sent[:stretches]
 
     def _silent(self, stamp_ns: int, *, complete: bool) -> None:
         """A topic without a message is too slow, once there was time for one."""

@@ -304,7 +304,10 @@ def _record_native(
     reopen_standard_streams()
     try:
         checked, checks_status = _checked(job, result.path)
-        status = status or checks_status
+        status = status or checks_status or (1 if result.failed_checks else 0)
+        for name, count in result.failed_checks.items():
+            times = f"{count} time{'s' if count > 1 else ''}"
+            tell(f"check violated {times} while the run went on: {name}")
         report_native(result, checked, as_json=as_json)
         if bag is not None:
             _export(result.path, bag, force=force)

@@ -17,7 +17,7 @@ from typing import Any
 from rsltrace.errors import JobError, RsltraceError, RunError, SetupError
 from rsltrace.job import Job, locate
 from rsltrace.native import support
-from rsltrace.native.last_seconds import LastSeconds, Programs
+from rsltrace.native.last_seconds import LastSeconds, LiveChecks, Programs
 from rsltrace.native.priorities import order, real_time_class
 from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
@@ -68,6 +68,8 @@ class NativeResult:
     stuck: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     kept: str = ""
+    failed_checks: Mapping[str, int] = field(default_factory=dict)
+    """How often checks failed while only the last seconds were kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +211,14 @@ class NativeRun:
         self.last = last = LastSeconds(
             spec, spans, programs, payload_filter(self.job), self._keep_file
         )
+        last.checks = LiveChecks(
+            self.job,
+            self.clocks.stamp,
+            lambda name, reason: last.trigger(reason, kind=f"check {name}"),
+            self._not_judged,
+        )
+        if last.checks.later:
+            self.note(f"judged only at the end: {'; '.join(last.checks.later)}")
         if threading.current_thread() is threading.main_thread():
             before = signal.signal(signal.SIGUSR1, lambda *_: last.trigger("SIGUSR1", at_once=True))
             stack.callback(signal.signal, signal.SIGUSR1, before)
@@ -217,6 +227,10 @@ class NativeRun:
             "writes them to a file"
         )
         return last
+
+    def _not_judged(self, text: str) -> None:
+        self.note(text)
+        self.lacks(text)
 
     def _keep_file(self, reason: str) -> None:
         """Write the last seconds to a file of their own; the run goes on."""
@@ -245,8 +259,9 @@ class NativeRun:
         more: Mapping[str, str] | None = None,
     ) -> None:
         now_ns, start_ns = time.monotonic_ns(), self.clocks.steady_ns
-        if self.last is not None:
-            start_ns = max(start_ns, self.last.since_ns)
+        if self.last is not None:  # writing it takes time
+            since_ns, now_ns = self.last.span_ns
+            start_ns = max(start_ns, since_ns)
         missing = [text for at_ns, text in self._missing if at_ns >= start_ns]
         missing += [] if self.last is None else self.last.missing
         writer.close(
@@ -351,7 +366,12 @@ class NativeRun:
             stuck=stuck,
             notes=(*self.notes, *_said(stuck, unreadable)),
             kept=self.writer.kept,
+            failed_checks=self._failed_checks(),
         )
+
+    def _failed_checks(self) -> Mapping[str, int]:
+        checks = None if self.last is None else self.last.checks
+        return {} if checks is None else checks.failed
 
     def _levels(self) -> dict[str, str]:
         if self.options.policy is None:

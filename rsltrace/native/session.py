@@ -58,7 +58,7 @@ def run_natively(
     :raises JobError, SetupError, OutputError: the run could not start or be written.
     """
     check_no_simulation()
-    expanded = expand_launch_files(job)
+    expanded = expand_launch_files(job, native=True)
     support.check(expanded.job)
     kind: type[SingleProcessRun | MultiProcessRun] = SingleProcessRun
     if options.processes or support.needs_processes(expanded.job):

@@ -128,6 +128,7 @@ class SpanRecorder:
         """How many spans are over."""
         self.activity_ns = 0
         """When something was last sent, steady."""
+        self.until_ns = 0
 
     def now_ns(self) -> int:
         """Read the steady clock."""
@@ -231,7 +232,8 @@ class SpanRecorder:
         One that goes on for longer than ``patience_ns`` is cut in two: it must not keep all others
         from the file. None takes everything, as it is.
         """
-        return self.finished_until(patience_ns)[0]
+        spans, self.until_ns = self.finished_until(patience_ns)
+        return spans
 
     def finished_until(self, patience_ns: int | None) -> tuple[list[CallbackSpan], int]:
         """Return ``finished``, and the steady time before which no other span begins."""

@@ -121,7 +121,10 @@ class ClockPair:
 
 
 class SpanSource(Protocol):
-    """Where spans come from."""
+    """Where spans come from. No other ones began before ``until_ns`` than it has given."""
+
+    @property
+    def until_ns(self) -> int: ...
 
     def finished(self, patience_ns: int | None) -> list[CallbackSpan]:
         """Take those before which all is over, in order of their starts."""

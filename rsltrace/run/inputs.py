@@ -12,9 +12,10 @@ from rsltrace.run.plans.executables import compiled_file, why_not_runnable
 from rsltrace.run.process import search_path
 
 
-def expand_launch_files(job: Job, *, programs: bool = True) -> JobExpansion:
-    """Return a job whose launch files are replaced by nodes; executables are also looked for in its
-    ``search_path``. Unless ``programs`` is False, this runs Python launch files.
+def expand_launch_files(job: Job, *, programs: bool = True, native: bool = False) -> JobExpansion:
+    """Return a job whose launch files are replaced by nodes, and for a ``native`` run other
+    programs; executables are also looked for in its ``search_path``. Unless ``programs`` is False,
+    this runs Python launch files.
 
     :raises JobError: a launch file is wrong, or starts what cannot be simulated.
     """
@@ -26,7 +27,13 @@ def expand_launch_files(job: Job, *, programs: bool = True) -> JobExpansion:
         return compiled_file(f"{package}/{executable}") is not None
 
     with search_path(job):
-        return expand(job, why_not=why_not_runnable, is_process=is_process, programs=programs)
+        return expand(
+            job,
+            why_not=why_not_runnable,
+            is_process=is_process,
+            programs=programs,
+            native=native,
+        )
 
 
 def check_output(job: Job, output: Path, replay: Path | None) -> None:

@@ -12,6 +12,7 @@ import pytest
 from rsltrace.adapters.launch.expand import read_in_child_process
 from rsltrace.adapters.launch.model import LaunchResult
 from rsltrace.adapters.launch.specs import node_specs
+from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
 from rsltrace.job.parts.process import RespawnSpec
 
@@ -69,6 +70,38 @@ def generate_launch_description():
         LoadComposableNodes(
             target_container="nobody",
             composable_node_descriptions=[ComposableNode(package="demo", plugin="demo::Lost")]),
+    ])
+"""
+
+
+PROGRAMS = """<launch>
+  <arg name="who" default="two words"/>
+  <executable cmd="./greet.sh $(var who) 'to you'" cwd="$(dirname)" name="greeter" respawn="true"
+              respawn_max_retries="2"><env name="OWN" value="2"/></executable>
+  <executable cmd="echo a ; echo b" shell="true" on_exit="shutdown"/>
+  <timer period="2"><executable cmd="no_such_program -x"/></timer>
+  <executable cmd="echo left out" if="false"/>
+</launch>"""
+
+PYTHON_PROGRAMS = """
+from launch import LaunchDescription
+from launch.actions import *
+from launch.conditions import IfCondition
+from launch.event_handlers import OnProcessExit
+from launch.substitutions import LaunchConfiguration, ThisLaunchFileDir
+
+
+def generate_launch_description():
+    last = ExecuteProcess(cmd=["echo a", "; echo b"], shell=True)
+    return LaunchDescription([
+        DeclareLaunchArgument("who", default_value="two"),
+        ExecuteProcess(cmd=["./greet.sh", LaunchConfiguration("who"), "words", "to you"],
+                       cwd=ThisLaunchFileDir(), name="greeter", additional_env={"OWN": "2"},
+                       respawn=True, respawn_max_retries=2),
+        last,
+        RegisterEventHandler(OnProcessExit(target_action=last, on_exit=[Shutdown()])),
+        TimerAction(period=2.0, actions=[ExecuteProcess(cmd=["no_such_program", "-x"])]),
+        ExecuteProcess(cmd=["echo", "left", "out"], condition=IfCondition("false")),
     ])
 """
 
@@ -139,3 +172,37 @@ def test_a_container_without_components_runs_if_it_can(read: Any) -> None:
     assert len(_specs(read(text))) == 2
     launched = read(text)
     assert (len(_specs(launched, compiled=False)), launched.unsupported) == (1, [])
+
+
+@pytest.mark.parametrize("language", ["xml", "python"])
+def test_other_programs_are_entries_of_native_runs(
+    language: str, read: Any, write: Callable[..., Path], tmp_path: Path
+) -> None:
+    def launched() -> LaunchResult:
+        if language == "xml":
+            return read(PROGRAMS)  # type: ignore[no-any-return]
+        return read_in_child_process(write(PYTHON_PROGRAMS, "a.launch.py"), {}, [])
+
+    program = tmp_path / "greet.sh"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    found = launched()
+    greet, shell = node_specs(
+        found, skip_unsupported=True, why_not=lambda package, name: None, native=True
+    )
+    assert (greet.program, greet.arguments) == (str(program), ("two", "words", "to you"))
+    assert (greet.working_directory, greet.environment) == (str(tmp_path), {"OWN": "2"})
+    assert greet.respawn == RespawnSpec(times=2)
+    assert not greet.required
+    assert (shell.program, shell.required) == ("/bin/sh", True)
+    assert shell.arguments[0] == "-c"
+    assert shell.arguments[1].split() == ["echo", "a", ";", "echo", "b"]
+    (missing,) = found.unsupported
+    assert str(missing).endswith(
+        "process 'no_such_program -x': there is no program no_such_program"
+    )
+    with pytest.raises(JobError, match="not all of the launch file can be run; "):
+        node_specs(launched(), skip_unsupported=False, why_not=lambda *_: None, native=True)
+    found = launched()
+    assert _specs(found) == []
+    assert {one.why for one in found.unsupported} == {"other programs do not run in a simulation"}

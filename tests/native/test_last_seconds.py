@@ -10,20 +10,23 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.adapters.processes.build import OBSERVER, find_compiler
+from rsltrace.adapters.rclpy.messages.interfaces import message_type
 from rsltrace.errors import SetupError
+from rsltrace.job import job_from_text
 from rsltrace.job.parts.record import LastSpec
 from rsltrace.native import last_seconds
-from rsltrace.native.last_seconds import LastSeconds
+from rsltrace.native.last_seconds import LastSeconds, LiveChecks
 from rsltrace.native.observed_entities import ObservedEntity
 from rsltrace.native.processes import programs
 from rsltrace.native.processes.programs import RecordFile, RecordKind
-from rsltrace.native.span_recorder import CallbackSpan, SentMessage
+from rsltrace.native.span_recorder import CallbackError, CallbackSpan, EmittedLog, SentMessage
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.contents import check_contents
 from rsltrace.trace.model.entity import Entity, EntityKind
@@ -126,6 +129,8 @@ def span(start_ns: int, *outputs: Entity | SentMessage) -> CallbackSpan:
 class Source:
     """Gives what it was given."""
 
+    until_ns = 0
+
     def __init__(self) -> None:
         self.spans: list[CallbackSpan] = []
 
@@ -202,7 +207,141 @@ def test_reasons_that_come_again_and_again_give_a_file_for_each_ten_seconds(
     assert len(kept.reasons) == 4
 
 
+# Checks while the run goes on.
+
+
+class Checked:
+    """Checks in a run that began at 0, and what they say."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, checks: str) -> None:
+        monkeypatch.setattr(last_seconds, "now_ns", lambda: 0)
+        job = job_from_text(f"nodes: [{{node: a:B}}]\nchecks:\n{checks}", "job.yaml", ".")
+        self.said: list[str] = []
+        self.lacks: list[str] = []
+        self.checks = LiveChecks(
+            job, int, lambda name, reason: self.said.append(reason), self.lacks.append
+        )
+
+    def add(self, at_ns: int, *outputs: Any) -> None:
+        self.checks.add([span(at_ns, *outputs)])
+
+    def look(self, until_ns: int) -> list[str]:
+        self.checks.look(until_ns)
+        said, self.said[:] = [*self.said], []
+        return said
+
+
+def number(value: int) -> SentMessage:
+    from std_msgs.msg import UInt64
+
+    message = sent("/n", bytes.fromhex("00010000") + value.to_bytes(8, "little"))
+    message.entity.sends = message_type(UInt64)
+    return message
+
+
+def test_checks_say_what_is_wrong_in_the_order_of_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked = Checked(
+        monkeypatch,
+        "- {name: small, always: /n.data < 5}\n- never: exception ValueError\n"
+        "- {never: log warn, after: /n.data == 2, within: 2s}\n"
+        "- {name: three, eventually: /n.data == 3, after: /n.data == 2, within: 3s}\n",
+    )
+    assert checked.checks.later == []
+    log = EmittedLog(number(0).entity, 30, "a", "so bad", "", "", 0)
+    checked.add(4 * S, log)
+    checked.add(1 * S, log)
+    checked.add(2 * S, CallbackError("KeyError", "'x'", ""), number(7))
+    checked.add(3 * S, number(2))
+    assert checked.look(2 * S) == []
+    assert checked.look(5 * S) == [
+        "check small: not /n.data < 5 (data = 7)",
+        "check never log warn within 2 s after /n.data == 2: log 'so bad'",
+    ]
+    checked.add(5 * S, CallbackError("ValueError", "of it", ""))
+    assert checked.look(7 * S) == [
+        "check never exception ValueError: raised ValueError: of it",
+        "check three: it does not happen within 3 s",
+    ]
+    assert checked.look(9 * S) == checked.lacks == []
+    assert checked.checks.failed["small"] == 1
+
+
+def test_a_topic_that_stops_is_too_slow_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked = Checked(monkeypatch, "- {rate: /n, at_least: 2 Hz}\n")
+    for tenth in range(20, 50):
+        checked.add(tenth * S // 10, number(1))
+        assert checked.look(tenth * S // 10 + 1) == []
+    assert checked.look(59 * S // 10) == [
+        "check rate /n at least 2 Hz: 1 messages from here to 5.800000000 s: 1 Hz, at least 2 Hz"
+    ]
+    assert len(checked.look(70 * S // 10)) == 1
+    assert checked.look(99 * S) == []
+
+
+def test_what_cannot_be_judged_is_said_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked = Checked(
+        monkeypatch,
+        "- always: /n.data < 5\n- eventually: /n\n- never: finding clock\n- function: m:f\n"
+        "- latency: {from: /n, to: /m, below: 1s}\n",
+    )
+    assert checked.checks.later == [
+        "eventually /n: it has no 'within'",
+        "never finding clock: it is not about messages of one topic, log records or exceptions",
+        "function m:f: it is about the whole run",
+        "latency of /n → /m below 1 s: it is about the whole run",
+    ]
+    message = number(1)
+    message.data = b""
+    checked.add(0, message)
+    checked.add(1, number(9))
+    assert checked.look(S) == []
+    assert checked.lacks == [
+        "check always /n.data < 5 is not judged any more: a message on /n is too large, or of an "
+        "unknown type"
+    ]
+
+
 # As a user has it.
+
+
+@pytest.mark.long
+def test_a_check_that_fails_writes_a_file(tmp_path: Path, compiled: Callable[[str], Path]) -> None:
+    """Of a program whose messages are not kept, and of a Python node."""
+    text = f"""
+nodes:
+  - {{node: robot:Talker}}
+  - {{program: {compiled("counter.c")}, arguments: ['100']}}
+record: {{last: 10s, exclude: [/count, /numbers]}}
+checks:
+  - {{CHECK}}
+stop: {{duration: 300s}}
+"""
+    for number, (check, reason) in enumerate(
+        (
+            ("{name: few, always: /count.data < 7}", "check few: not /count.data < 7 (data = 7)"),
+            ("{never: /numbers.data == 9}", "check never /numbers.data == 9: /numbers.data == 9"),
+        )
+    ):
+        path = job(tmp_path, text.replace("{CHECK}", check))
+        process = subprocess.Popen(
+            [*COMMAND, "record", "--native", str(path), "-o", f"{number}.mcap"],
+            cwd=tmp_path,
+            env=environment(tmp_path),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            deadline = time.monotonic() + 120
+            kept = tmp_path / f"{number}-1.mcap"
+            while not kept.exists() and time.monotonic() < deadline:
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            process.wait(timeout=120)
+        finally:
+            process.kill()
+            process.wait()
+        with Trace.open(kept) as trace:
+            assert trace.result["stop_reason"].startswith(f"kept: {reason}")
 
 
 @pytest.mark.long

@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -21,7 +22,7 @@ from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.trace.native import callback_figures, timings
 from rsltrace.trace.reader import Trace
-from tests.native.running import COMMAND, environment, events_of, job, record
+from tests.native.running import COMMAND, ROBOT, environment, events_of, job, record
 from tests.processes.conftest import compiled
 
 __all__ = ["compiled"]
@@ -223,6 +224,33 @@ def test_a_program_that_fails_is_an_error(tmp_path: Path, command: Any) -> None:
     done = command("record", "--native", "-o", "x.mcap", "--", "./fails.sh")
     assert done.returncode == 3
     assert "./fails.sh ended with exit status 127, " in done.stderr
+
+
+def test_other_programs_of_a_launch_file_run_and_what_they_start_is_observed(
+    tmp_path: Path, command: Any
+) -> None:
+    """The shell starts Python: the first of it is a node, the others are told to end by the end."""
+    node = f"{sys.executable} -c 'import robot_mains; robot_mains.talk()' 5"
+    (tmp_path / "a.launch.py").write_text(f"""
+from launch import LaunchDescription
+from launch.actions import ExecuteProcess, Shutdown
+
+def generate_launch_description():
+    return LaunchDescription([
+        ExecuteProcess(cmd=[{node!r}], shell=True, on_exit=Shutdown(),
+                       additional_env={{"PYTHONPATH": {str(ROBOT)!r}}}),
+        ExecuteProcess(cmd=["sh", "-c", 'echo "$1" > said; sleep 1000', "sh", "a  b"]),
+        ExecuteProcess(cmd=["sh", "-c", "trap '' INT; while true; do sleep 0.1; done"]),
+    ])
+""")
+    done = command("record", "--native", "--launch", "a.launch.py", "-o", "run.mcap")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "said").read_text() == "a  b\n"
+    assert "sh, told to end, was killed by SIGTERM" in done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert trace.result["stop_reason"] == "/bin/sh has ended, which the run requires"
+        sent = [trace.decode("/numbers", data).data for _, _, data in trace.messages("/numbers")]  # type: ignore[attr-defined]
+        assert sent == [0, 1, 2, 3, 4]
 
 
 def test_a_bag_is_played_in_real_time(tmp_path: Path, command: Any) -> None:

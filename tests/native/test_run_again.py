@@ -284,6 +284,17 @@ def test_other_orders_from_a_time_on(tmp_path: Path, command: Any) -> None:
     assert "again.mcap is of a simulated run: explore its job" in simulated.stderr
 
 
+def test_a_run_without_callbacks_is_run_again(tmp_path: Path, command: Any) -> None:
+    (tmp_path / "talking.py").write_text(
+        "import rclpy\nfrom std_msgs.msg import String\n\ndef main():\n    rclpy.init()\n"
+        "    rclpy.create_node('a').create_publisher(String, '/t', 1).publish(String())\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{main: 'talking:main'}]\n")
+    assert command("record", "--native", "job.yaml", "-o", "native.mcap").returncode == 0
+    done = command("replay", "native.mcap", "-q")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_the_debugger_runs_it_again(tmp_path: Path, command: Any) -> None:
     recorded(tmp_path, "node: mixing:Server")
     words = ("-c", "break topic /mixed", "-c", "continue", "-c", "reverse-step", "-c", "continue")

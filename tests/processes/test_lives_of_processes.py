@@ -70,6 +70,14 @@ def test_a_process_starts_again_as_often_as_it_may(
         assert len({event.entity for event in starts}) == 2
 
 
+def test_a_process_that_ends_at_once_starts_again(compiled: Compiled, tmp_path: Path) -> None:
+    entry = "    arguments: [-c, 'echo again >> said']\n    respawn: {delay: 250ms, times: 2}"
+    entry += "\n    working_directory: ."
+    result = _run(tmp_path, Path("/bin/sh"), entry)
+    assert (result.error, result.exit_code) == (None, 0)
+    assert (tmp_path / "said").read_text() == "again\n" * 3
+
+
 def test_a_run_ends_with_a_process_that_it_requires(compiled: Compiled, tmp_path: Path) -> None:
     entry = "    arguments: ['100', leave]\n    name: driver\n    required: true"
     result = _run(tmp_path, compiled("counter.c"), entry)

@@ -465,7 +465,7 @@ def test_a_process_finds_the_libraries_of_the_prefixes_that_are_sourced(tmp_path
         (tmp_path / name / "lib" / "libmine.so").touch()
     prefixes = ":".join(str(tmp_path / name) for name in ("has", "known", "has_none"))
     around = {"AMENT_PREFIX_PATH": prefixes, "LD_LIBRARY_PATH": f"{tmp_path}/known/lib"}
-    preload = PreloadLibrary(tmp_path / "a.so", tmp_path / "b.so", find_ros())
+    preload = PreloadLibrary(tmp_path / "a.so", find_ros())
     made = program(
         [sys.executable], preload, surroundings=around, environment={}, folder=None
     ).environment

@@ -95,8 +95,7 @@ def test_a_process_that_starts_when_rsltrace_is_gone_does_not_run() -> None:
     here, there = socket.socketpair()
     link = f"{there.fileno()}:{1 << 29}:0:0"
     libraries = os.pathsep.join(map(str, built.ros.libraries))
-    preload = f"{built.path}:{built.python_symbols}"
-    around = {"LD_PRELOAD": preload, "LD_LIBRARY_PATH": libraries, "RSLTRACE_LINK": link}
+    around = {"LD_PRELOAD": str(built.path), "LD_LIBRARY_PATH": libraries, "RSLTRACE_LINK": link}
     with there:
         with here:
             outside = subprocess.run(["/bin/true"], env=around, pass_fds=[there.fileno()])

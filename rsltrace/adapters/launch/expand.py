@@ -123,25 +123,27 @@ def expand(
     why_not: Callable[[str, str], str | None],
     is_process: Callable[[str, str], bool],
     programs: bool = True,
+    native: bool = False,
 ) -> JobExpansion:
     """Return a job whose launch files have become nodes.
 
     A Python launch file is a program, and so is the ``setup.py`` of a package that nobody has
     built: they are run to do so, or not used if ``programs`` is False.
     ``why_not(package, executable)`` says why an executable cannot be simulated, if it cannot, and
-    ``is_process`` whether it runs as a process of its own.
+    ``is_process`` whether it runs as a process of its own. Only a ``native`` run has programs that
+    are no nodes.
 
     :raises JobError: if a launch file is wrong, or starts what cannot be simulated.
     """
     if not job.launch:
         return JobExpansion(job)
     if not programs:
-        return _expand(job, None, why_not, is_process)
+        return _expand(job, None, why_not, is_process, native)
     folders = [job.resolve(folder) for folder in job.search_path]
     around = [f for spec in job.launch for f in workspaces_of(job.resolve(spec.file))]
     new = [folder for folder in dict.fromkeys(around) if folder not in folders]
     with unbuilt_packages([*folders, *new]):
-        expanded = _expand(job, [*folders, *new], why_not, is_process)
+        expanded = _expand(job, [*folders, *new], why_not, is_process, native)
     job = expanded.job
     named = {spec.executable.partition("/")[0] for spec in job.nodes if spec.executable}
     if new and not named.isdisjoint(source_packages(new)):
@@ -155,6 +157,7 @@ def _expand(
     folders: Sequence[Path] | None,
     why_not: Callable[[str, str], str | None],
     is_process: Callable[[str, str], bool],
+    native: bool,
 ) -> JobExpansion:
     """Do so; ``folders`` are those of packages and modules, None if no programs are to run."""
     nodes: list[NodeSpec] = list(job.nodes)
@@ -167,6 +170,7 @@ def _expand(
             why_not=why_not,
             is_process=is_process,
             before=nodes,
+            native=native,
         )
         notes += [f"left out: {item}" for item in launched.unsupported]
         notes += launched.ignored

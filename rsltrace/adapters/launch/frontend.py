@@ -34,13 +34,15 @@ _WITHOUT_MEANING = (
     "log_cmd",
     "sigterm_timeout",
     "sigkill_timeout",
-    "shell",
 )
 """How a process is run: nothing that a node could tell in a simulation."""
-_NODE = (
-    *("pkg", "exec", "name", "node-name", "namespace", "args", "ros_args", "autostart"),
+_PROCESS = (
     *("launch-prefix", "cwd", "respawn", "respawn_delay", "respawn_max_retries"),
     *("on_exit", "required", *_WITHOUT_MEANING),
+)
+_NODE = (
+    *("pkg", "exec", "name", "node-name", "namespace", "args", "ros_args", "autostart"),
+    *("shell", *_PROCESS),
 )
 _COMPONENT = ("pkg", "plugin", "name", "namespace")
 
@@ -308,8 +310,9 @@ def _set_remap(element: Element) -> Action:
 
 
 def _executable(element: Element) -> Action:
-    command = _text(element, "cmd")
-    return nodes.ExecuteProcess(cmd=[] if command is None else [command])
+    element.check(["cmd", "name", "shell", *_PROCESS], ["env"])
+    command, shell = _words(element, "cmd") or (), _flag(element, "shell")
+    return _process(element, nodes.ExecuteProcess, cmd=command, shell=shell)
 
 
 # Nodes and components.
@@ -319,12 +322,12 @@ def _node(element: Element) -> Action:
     element.check(_NODE, ["param", "remap", "env"])
     kind = nodes.Node if element.get("autostart") is None else nodes.LifecycleNode
     extra = {} if kind is nodes.Node else {"autostart": _flag(element, "autostart")}
-    return _process(element, kind, **extra)
+    return _node_process(element, kind, **extra)
 
 
 def _container(element: Element) -> Action:
     element.check(_NODE, ["param", "remap", "env", "composable_node"])
-    return _process(
+    return _node_process(
         element, nodes.ComposableNodeContainer, composable_node_descriptions=_components(element)
     )
 
@@ -337,14 +340,22 @@ def _load(element: Element) -> Action:
     )
 
 
-def _process(element: Element, kind: Callable[..., nodes.ExecuteLocal], **more: Any) -> Action:
-    process = kind(
+def _node_process(element: Element, kind: Callable[..., nodes.Node], **more: Any) -> Action:
+    return _process(
+        element,
+        kind,
         executable=_need(element, "exec"),
         package=_text(element, "pkg"),
         name=_text(element, "name") or _text(element, "node-name"),
         **_node_settings(element),
         arguments=_words(element, "args"),
         ros_arguments=_words(element, "ros_args"),
+        **more,
+    )
+
+
+def _process(element: Element, kind: Callable[..., nodes.ExecuteLocal], **more: Any) -> Action:
+    process = kind(
         prefix=_text(element, "launch-prefix"),
         cwd=_text(element, "cwd"),
         env=dict(_pairs(element.named("env"), "name", "value")),

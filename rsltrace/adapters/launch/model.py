@@ -257,7 +257,8 @@ class ProcessSettings:
     """What a launch file says of the process of a node: where it runs, and when again.
 
     ``environment`` is what differs from that of the launch file; ``own`` names what of these is
-    said for the process alone, ``without`` what processes are not given here (``launch-prefix``).
+    said for the process alone, ``without`` what processes of nodes are not given here
+    (``launch-prefix``).
     ``respawn`` is how much later (ns) it starts again, and how often at most.
     """
 
@@ -275,10 +276,10 @@ def respawning(delay_s: float, times: int) -> tuple[int, int | None] | None:
 
 @dataclass(frozen=True, slots=True)
 class LaunchedNode:
-    """A node that a launch file starts.
+    """A node, or another program, that a launch file starts.
 
-    ``executable`` is that of ``package``; a component has a ``plugin`` instead, and the full name
-    of a ``container`` that loads it. ``name`` and
+    ``executable`` is that of ``package``; another program has a ``command`` instead. A component
+    has a ``plugin``, and the full name of a ``container`` that loads it. ``name`` and
     ``namespace`` are None where the launch file leaves them to the node. ``where`` is
     ``file:line:column``, as far as it is known. It starts ``delay_ns`` after the launch file
     (``<timer>``); or, if there is an ``after``, after the node with that ``number`` has ``started``
@@ -286,8 +287,9 @@ class LaunchedNode:
     """
 
     where: str
-    package: str
+    package: str = ""
     executable: str = ""
+    command: tuple[str, ...] = ()
     plugin: str = ""
     name: str | None = None
     namespace: str | None = None
@@ -305,6 +307,11 @@ class LaunchedNode:
     extra_arguments: Parameters = ()
 
     @property
+    def is_program(self) -> bool:
+        """Whether it is no node of a package, but another program."""
+        return not self.package
+
+    @property
     def full_name(self) -> str:
         """Its name with its namespace, as far as the launch file says it."""
         return full_name(self.namespace, self.name or "")
@@ -312,6 +319,8 @@ class LaunchedNode:
     @property
     def title(self) -> str:
         """How to call it in a message."""
+        if self.is_program:
+            return f"process {' '.join(self.command)!r:.200}" if self.command else "a process"
         what = f"{self.package}/{self.executable or self.plugin}"
         return printable(f"{what} ({self.name})" if self.name else what)
 

@@ -36,7 +36,6 @@ from rsltrace.errors import JobError
 from rsltrace.job.values.times import parse_time
 
 _NOT_IN_A_RUN = "a run has all its nodes from the start, and ends by the job's stop: conditions"
-_PROCESS = "other programs do not run in a simulation"
 _FRONT_ENDS = {".xml": "launch_xml", ".yaml": "launch_yaml", ".yml": "launch_yaml"}
 
 
@@ -160,9 +159,7 @@ class _LaunchVisitor:
         elif isinstance(action, Node):
             self._node(action)
         elif isinstance(action, actions.ExecuteLocal):
-            command = getattr(action, "cmd", None) or [["?"]]
-            words = " ".join(self._text(word) for word in command)
-            self._refuse(f"process {words!r}", _PROCESS)
+            self._program(action)
         elif isinstance(action, (actions.TimerAction, RosTimer)):
             self._timer(action)
         elif isinstance(action, actions.RegisterEventHandler):
@@ -246,11 +243,7 @@ class _LaunchVisitor:
                 f"autostart of {package}/{executable}",
                 "nobody changes the states of lifecycle nodes here: let a node of the job do it",
             )
-        self._kept.append(node)
-        on_exit = getattr(node, "_ExecuteLocal__on_exit", None)
-        if on_exit and not callable(on_exit):
-            listed = on_exit if isinstance(on_exit, (list, tuple)) else [on_exit]
-            self._later.append((("ended", id(node)), list(listed)))
+        self._keep(node)
         self.launched.nodes.append(
             LaunchedNode(
                 surroundings=self._surroundings(node),
@@ -269,6 +262,28 @@ class _LaunchVisitor:
                 ros_arguments=self._words(node._Node__ros_arguments),
             )
         )
+
+    def _program(self, action: Any) -> None:
+        self._keep(action)
+        words = self._words(getattr(action, "cmd", None))
+        self.launched.nodes.append(
+            LaunchedNode(
+                self.where(),
+                command=("/bin/sh", "-c", " ".join(words)) if action.shell else words,
+                surroundings=self._surroundings(action),
+                delay_ns=self._delay_ns,
+                after=self._after,
+                number=id(action),
+            )
+        )
+
+    def _keep(self, action: Any) -> None:
+        """Keep an action, and what follows when its process ends."""
+        self._kept.append(action)
+        on_exit = getattr(action, "_ExecuteLocal__on_exit", None)
+        if on_exit and not callable(on_exit):
+            listed = on_exit if isinstance(on_exit, (list, tuple)) else [on_exit]
+            self._later.append((("ended", id(action)), list(listed)))
 
     def _surroundings(self, node: Any) -> ProcessSettings:
         process = node.process_description

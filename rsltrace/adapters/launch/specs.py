@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
@@ -33,11 +34,13 @@ def node_specs(
     why_not: Callable[[str, str], str | None],
     is_process: Callable[[str, str], bool] = lambda package, executable: False,
     before: Sequence[NodeSpec] = (),
+    native: bool = False,
 ) -> list[NodeSpec]:
     """Return the nodes as entries of a job; ``launched.unsupported`` grows by what is left out.
 
     ``why_not(package, executable)`` says why an executable cannot be simulated, ``is_process``
     whether it runs as a process of its own. ``before`` are the entries that the job has already.
+    Only a ``native`` run has other programs.
 
     :raises JobError: with everything that cannot be simulated, unless that is to be skipped.
     """
@@ -45,7 +48,10 @@ def node_specs(
     containers = {full_name(spec.namespace, spec.name) for spec in before if spec.name}
     runs: list[LaunchedNode] = []
     for node in _without_idle_containers(launched.nodes, why_not):
-        why = _why_not(node, why_not, containers)
+        if node.is_program:
+            why = _why_no_program(node) if native else "other programs do not run in a simulation"
+        else:
+            why = _why_not(node, why_not, containers)
         if why is not None:
             launched.unsupported.append(UnsupportedItem(node.where, node.title, why))
         else:
@@ -63,11 +69,12 @@ def node_specs(
     ]
     launched.unsupported.sort(key=_position)
     if launched.unsupported and not skip_unsupported:
+        ran = "run" if native else "simulated"
         listed = launched.unsupported[:_LISTED_MAX]
         more = len(launched.unsupported) - len(listed)
         lines = "".join(f"\n  {item}" for item in listed) + (f"\n  and {more} more" if more else "")
         raise JobError(
-            f"not all of the launch file can be simulated; --skip-unsupported (skip_unsupported: "
+            f"not all of the launch file can be {ran}; --skip-unsupported (skip_unsupported: "
             f"true in a job) leaves this out:{lines}"
         )
     return specs
@@ -113,7 +120,7 @@ def _note_what_is_lost(
 ) -> None:
     for node in nodes:
         said = node.surroundings
-        if is_process(node.package, node.executable):
+        if node.is_program or is_process(node.package, node.executable):
             if said.without:
                 why = "processes are started as they are"
                 launched.ignored.append(f"{node.where}: {', '.join(said.without)}: {why}")
@@ -136,6 +143,21 @@ def _why_not(
     if "." not in node.plugin and ":" not in node.plugin:
         return "a Python component is written module.Class, or module:Class"
     return None
+
+
+def _program(node: LaunchedNode) -> str | None:
+    """Return the path of what a command starts, as its process would look for it."""
+    said = node.surroundings
+    name, path = node.command[0], dict(said.environment).get("PATH")
+    if "/" in name:
+        name = os.path.abspath(os.path.join(said.folder, name))
+    return shutil.which(name, path=path)
+
+
+def _why_no_program(node: LaunchedNode) -> str | None:
+    if not node.command:
+        return "it has no command"
+    return None if _program(node) else f"there is no program {node.command[0]}"
 
 
 def _spec(
@@ -165,6 +187,15 @@ def _spec(
     elif node.delay_ns:
         values["start_after"] = StartAfterSpec.after(node.delay_ns)
     try:
+        if node.is_program:
+            values = {key: values[key] for key in ("origin", "start_after") if key in values}
+            return NodeSpec(
+                program=_program(node),
+                arguments=node.command[1:],
+                required=is_required,
+                **_surroundings(node.surroundings),
+                **values,
+            )
         if "::" in node.plugin:
             extra = [item for item in node.extra_arguments if isinstance(item, dict)]
             return NodeSpec(

@@ -101,11 +101,9 @@ def find_compiler() -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class PreloadLibrary:
-    """What is preloaded into processes. ``python_symbols`` stands in for what libraries of ROS
-    want from Python, in programs that have none."""
+    """What is preloaded into processes."""
 
     path: Path
-    python_symbols: Path
     ros: RosInstallation
 
 
@@ -144,7 +142,7 @@ def library(
     if not _is_whole(folder):
         shutil.rmtree(folder, ignore_errors=True)
         folder = cached_folder("processes", name, make)
-    return PreloadLibrary(folder / _NAME, folder / _STUB, ros)
+    return PreloadLibrary(folder / _NAME, ros)
 
 
 def _digest(folder: Path) -> str:
@@ -177,15 +175,18 @@ def _build(
     include = [f"-I{path}" for path in ros.include]
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         objects = {path: f"{scratch}/{path.stem}.o" for path in sources if path.suffix == ".cpp"}
-        _run([*compiler, "-c", str(path), "-o", made, *include] for path, made in objects.items())
-        where = ros.prefix / "lib"
-        link = [f"-L{where}", f"-Wl,-rpath,{where}", *(f"-l{name}" for name in _LIBRARIES), "-ldl"]
+        stub = [*compiler, "-shared", str(_STUB_SOURCE), "-o", str(folder / _STUB)]
         _run(
             [
-                [*compiler, "-shared", *objects.values(), "-o", str(folder / _NAME), *link],
-                [*compiler, "-shared", str(_STUB_SOURCE), "-o", str(folder / _STUB)],
+                [*stub, f"-Wl,-soname,{_STUB}"],
+                *([*compiler, "-c", str(path), "-o", to, *include] for path, to in objects.items()),
             ]
         )
+        where = ros.prefix / "lib"
+        link = [f"-L{where}", f"-Wl,-rpath,{where}:$ORIGIN"]
+        link += [*(f"-l{name}" for name in _LIBRARIES), "-ldl"]
+        link += ["-Wl,--no-as-needed", str(folder / _STUB)]
+        _run([[*compiler, "-shared", *objects.values(), "-o", str(folder / _NAME), *link]])
 
 
 def _run(commands: Iterable[list[str]]) -> None:
@@ -340,18 +341,14 @@ def program(
     ``environment``.
 
     Python finds modules in ``search_path``, and the ament index packages in ``prefixes``.
-    Python's output is not buffered: a process may be killed at any time. Programs without Python
-    get stand-ins for the symbols of Python that libraries of ROS ask for.
+    Python's output is not buffered: a process may be killed at any time.
     """
     path = Path(command[0])
-    preload = [str(library.path)]
     with path.open("rb") as file:
-        needs_symbols = b"libpython" not in file.read() and is_compiled(path)
-    if needs_symbols and path.resolve() != Path(sys.executable).resolve():
-        preload.append(str(library.python_symbols))
+        is_native = b"libpython" not in file.read() and is_compiled(path)
     libraries = [str(place) for place in library.ros.libraries]
     around = {**surroundings, _UNBUFFERED: "1", **environment}
-    around["LD_PRELOAD"] = os.pathsep.join([*preload, *_listed(around, "LD_PRELOAD")])
+    around["LD_PRELOAD"] = os.pathsep.join([str(library.path), *_listed(around, "LD_PRELOAD")])
     if search_path:
         around["PYTHONPATH"] = os.pathsep.join([*search_path, *_listed(around, "PYTHONPATH")])
     if prefixes:  # what is built comes first
@@ -362,7 +359,7 @@ def program(
     fixed = True if pinned else None
     noise, _, random = around.pop(MEMORY_NOISE, "0:0").partition(":")
     fragments = 0
-    if needs_symbols:  # Python depends on addresses as the run's own process does
+    if is_native:  # Python depends on addresses as the run's own process does
         fixed, fragments = fixed if random == "0" else False, int(noise)
     return ProcessProgram(
         list(command), around, folder, fixed, fragments, instant_sleep, intra_process

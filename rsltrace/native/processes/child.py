@@ -152,7 +152,7 @@ def main(number: int) -> None:
 def _become(order: EntryOrder, link: Link) -> None:
     """Become another program; the kernel still ends it with the run."""
     link.send("ready", {})
-    if link.receive() is None:
+    if link.receive() != ("go",):
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     link.close_on_exec()

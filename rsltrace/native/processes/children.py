@@ -135,15 +135,28 @@ class ObservedProcess(threading.Thread):
     def stop(self) -> None:
         """Tell it to end: as ``ros2 launch`` does, if it is a main."""
         self.is_stopping = True
+        if not self.is_ready.is_set():  # it is being started again
+            self.has_begun = False
+            self.kill()
+            return
         with suppress(OSError):
             self._link.send("stop")
         if not (self.what.is_main and self.has_begun):
             return
-        if self.what.order.command:  # with all that it has started, as Ctrl-C in a terminal
-            with suppress(ProcessLookupError):
-                os.killpg(self.number, signal.SIGINT)
+        if self.what.order.command:
+            self._signal_all(signal.SIGINT)
         else:
             self._process.send_signal(signal.SIGINT)
+
+    def terminate(self) -> None:
+        """Tell a program that has not ended once more."""
+        if self.what.order.command:
+            self._signal_all(signal.SIGTERM)
+
+    def _signal_all(self, number: int) -> None:
+        """Send a signal to the process and all that it has started, as a terminal does."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.number, number)
 
     def kill(self) -> None:
         """Kill the process with all that it has started."""

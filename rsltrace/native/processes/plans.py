@@ -21,7 +21,7 @@ from rsltrace.job import Job, NodeSpec, locate
 from rsltrace.native.processes.children import ProcessStart
 from rsltrace.native.processes.wire import EntryOrder
 from rsltrace.run.plans.entries import arguments_for_all, arguments_of, entry_keys, start_rule
-from rsltrace.run.plans.processes import ProcessPrograms, as_python
+from rsltrace.run.plans.processes import ProcessPrograms, as_python, ros_words
 
 THE_BAGS = "the bags"
 """The name of the process that plays them."""
@@ -97,8 +97,9 @@ def _command(job: Job, index: int, processes: ProcessPrograms, where: str) -> tu
     words = processes.command(spec, where)
     if words is None:
         return ()
-    arguments = arguments_of(job, index, arguments_for_all(job), where=where)
-    return (*words, *spec.arguments, *(word for part in arguments for word in part.arguments))
+    for_all = [] if spec.program and spec.origin else arguments_for_all(job)  # no node of a package
+    arguments = arguments_of(job, index, for_all, where=where)
+    return (*words, *spec.arguments, *ros_words(arguments))
 
 
 def _environment(spec: NodeSpec, processes: ProcessPrograms, *, is_program: bool) -> dict[str, str]:

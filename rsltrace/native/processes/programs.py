@@ -25,6 +25,7 @@ from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class, message_type
 from rsltrace.errors import SetupError
 from rsltrace.job import Job
+from rsltrace.native.last_seconds import checked_topics
 from rsltrace.native.message_observer import channel_of
 from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
 from rsltrace.native.span_recorder import (
@@ -56,7 +57,9 @@ def variables_of(job: Job, folder: Path) -> dict[str, str]:
     record, last = job.record, job.record.last
     sizes = (_MEMORY, 0, _MEMORY) if last is None else (last.memory, 1, last.largest)
     kept = record.topics if record.payloads else ()
-    lists = (("+", kept), ("-", record.exclude), ("!", () if last is None else last.keep_on))
+    lists = [("+", kept), ("-", record.exclude)]
+    if last is not None:
+        lists += [("!", last.keep_on), ("?", tuple(checked_topics(job)))]
     names = (f"{mark}{name}" for mark, globs in lists for name in globs)
     return {FOLDER: str(folder), _SETTINGS: "\n".join((" ".join(map(str, sizes)), *names))}
 
@@ -86,7 +89,7 @@ class RecordKind(IntEnum):
 _MAGIC = 0x32656361_72746C73
 _HEAD_SIZE = 4096
 _CAPACITY, _WRITTEN, _READ, _IS_WRITING, _LOST, _CPU_NS, _RESERVED = range(1, 8)
-_MADE_WRITTEN, _MADE_READ, _TRIGGERED_NS, _TRIGGER, _ENDED, _STARTS = range(8, 14)
+_MADE_WRITTEN, _MADE_READ, _TRIGGERED_NS, _TRIGGER, _ENDED, _UNCHECKED, _STARTS = range(8, 15)
 _PARTS = 256
 _MADE_SIZE = 1 << 20
 _RECORD = struct.Struct("=IIqqII")
@@ -122,11 +125,18 @@ class RecordFile:
         """Whether there were records before those that ``last`` has returned."""
         self._made = bytearray()
         """If only the last records are kept: all those that make entities."""
+        self.checked: list[Record] = []
+        """These, and those that checks are about, until somebody has taken them."""
 
     @property
     def lost(self) -> int:
         """How many records found no room."""
         return self._head[_LOST]
+
+    @property
+    def unchecked(self) -> int:
+        """How many messages no check has seen."""
+        return self._head[_UNCHECKED]
 
     def cpu_ns(self, process: int) -> int:
         """Return the processor time since then, 0 if the process is no more."""
@@ -178,13 +188,15 @@ class RecordFile:
         return ended & 0xFF if ended else None
 
     def read_made(self) -> None:
-        """Take what makes entities, and make room for more."""
+        """Take what makes entities, and what checks are about, and make room for more."""
         head = self._head
         start, end = head[_MADE_READ], head[_MADE_WRITTEN]
         if start != end:
             begin = _HEAD_SIZE + head[_CAPACITY]
-            self._made += self._part(begin, _MADE_SIZE, start, end)
+            data = memoryview(self._part(begin, _MADE_SIZE, start, end))
             head[_MADE_READ] = end
+            self.checked += _records(data)
+            self._made += b"".join(_records_of(data, RecordKind.NAME))
 
     def last(self) -> tuple[list[Record], Iterator[Record]]:
         """Return the records that make entities, and of the others those that are left."""
@@ -205,14 +217,23 @@ def _first(starts: list[int], low: int, end: int) -> int:
 
 
 def _records(data: memoryview) -> Iterator[Record]:
+    for one in _records_of(data):
+        size, kind, steady_ns, wall_ns, thread, spent_ns = _RECORD.unpack_from(one)
+        fields = RecordReader(one[_RECORD.size : size])
+        yield Record(kind, steady_ns, wall_ns, thread, spent_ns, fields)
+
+
+def _records_of(data: memoryview, kind_max: int = RecordKind.LOST) -> Iterator[memoryview]:
+    """Yield the bytes of records of the kinds up to one."""
     at = 0
     while at < len(data):
-        size, kind, steady_ns, wall_ns, thread, spent_ns = _RECORD.unpack_from(data, at)
+        size, kind, *_ = _RECORD.unpack_from(data, at)
         if size < _RECORD.size:
             raise ValueError("the process has written over its records")
-        fields = RecordReader(data[at + _RECORD.size : at + size])
-        yield Record(kind, steady_ns, wall_ns, thread, spent_ns, fields)
-        at += (size + 7) // 8 * 8
+        end = at + (size + 7) // 8 * 8
+        if kind <= kind_max:
+            yield data[at:end]
+        at = end
 
 
 # From records to spans.
@@ -611,6 +632,18 @@ class ObservedProgram:
                     how = "was killed" if file.status is None else f"exit status {file.status}"
                     yield now_ns(), f"the end of process {path.stem} of {self._name}: {how}"
 
+    def checked(self) -> list[CallbackSpan]:
+        """Return what is new of what checks are about."""
+        found: list[CallbackSpan] = []
+        for file, spans in self._files.values():
+            records, file.checked = file.checked, []
+            for record in records:
+                spans.add(record)
+                if record.kind == RecordKind.SENDING:
+                    spans.begin_late()  # nobody knows what it is a part of
+            found += spans.finished(now_ns(), CUT_AFTER_NS)[0]
+        return found
+
     @property
     def is_forgotten(self) -> bool:
         """Whether nothing is left of its processes."""
@@ -645,6 +678,8 @@ class ObservedProgram:
             found += spans.finished(at_ns, None)[0]
             if file.lost:
                 missing.append(f"{file.lost} records of {self._name}, for which there was no room")
+            if file.unchecked:
+                missing.append(f"checks on {file.unchecked} messages of {self._name}: too many")
             if file.status is None and path in self._ended_ns and int(path.stem) != self.own:
                 missing.append(
                     f"of {self._name}, which was killed, what each thread was just doing"

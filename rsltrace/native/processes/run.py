@@ -138,6 +138,7 @@ class SpanMerger:
         self._lock = threading.Lock()
         self._sources: list[ProcessSpans] = []
         self._latest_ns = 0
+        self.until_ns = 0
         self.late = 0
         """Spans that came too late for their place, and were put after what was written."""
 
@@ -162,7 +163,9 @@ class SpanMerger:
     def finished(self, patience_ns: int | None) -> list[CallbackSpan]:
         """Take what is in order, everything if ``patience_ns`` is None."""
         with self._lock:
-            taken = self._taken(self._until(patience_ns))
+            now, until_ns = now_ns(), self._until(patience_ns)
+            self.until_ns = now if until_ns is None else until_ns
+            taken = self._taken(until_ns)
         for span in taken:
             if span.start_ns < self._latest_ns:
                 self.late += 1
@@ -193,7 +196,7 @@ class SpanMerger:
         return taken
 
 
-_KILLED_AFTER_S = ENDS_WITHIN_S + 3.0
+_KILLED_WITHIN_S = 3.0
 """A process that is stuck ends itself before; this is for one that cannot."""
 Counts = tuple[int, int, int, int, int]
 """Of a process: its events, when it was last active (steady), messages that could not be read,
@@ -415,7 +418,7 @@ class MultiProcessRun(NativeRun):
             how += f": {child.exit_text}"
         self.starts.tell("ended", what.key)
         if child.is_stopping or child.has_failed:
-            if status < 0 and not (child.is_stuck or status == -signal.SIGINT):
+            if status < 0 and child.has_begun and not (child.is_stuck or status == -signal.SIGINT):
                 self.notes.append(f"{what.name}, told to end, {how}")
             return
         if not child.has_begun:
@@ -442,14 +445,19 @@ class MultiProcessRun(NativeRun):
         name, program = child.what.name, self._programs.get(child)
         if program is not None and program.lost and self.last is None:
             self.lacks(f"{program.lost} records of {name}, for which there was no room")
-        if program is not None and program.unobserved:
-            self.lacks(
-                f"{program.unobserved} processes of {name}, which made no file: killed before, or "
-                f"no room in {self._folder}"
-            )
+        if program is not None and self.last is None:
+            for text in self._without_file(child, program):
+                self.lacks(text)
         if child.has_begun and status < 0 and status != -signal.SIGINT:
             what = "the last 50 ms" if program is None else "what each thread was just doing"
             self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
+
+    def _without_file(self, child: ObservedProcess, program: ObservedProgram) -> Iterator[str]:
+        if child.is_over and program.unobserved:
+            yield (
+                f"{program.unobserved} processes of {child.what.name}, which made no file: killed "
+                f"before, or no room in {self._folder}"
+            )
 
     @property
     def _at(self) -> str:
@@ -474,6 +482,10 @@ class MultiProcessRun(NativeRun):
             if child.is_over and program.is_forgotten:
                 del self._programs[child]
 
+    def checked(self) -> list[CallbackSpan]:
+        """Return what programs have sent on topics of checks."""
+        return [span for program in list(self._programs.values()) for span in program.checked()]
+
     def last_of_programs(self, since_ns: int) -> tuple[list[CallbackSpan], list[str]]:
         """Return what programs keep, and what is missing of it."""
         spans: list[CallbackSpan] = []
@@ -485,7 +497,7 @@ class MultiProcessRun(NativeRun):
                 missing.append(f"what {child.what.name} did: {error}")
             else:
                 spans += found
-                missing += lost
+                missing += [*lost, *self._without_file(child, program)]
         return spans, missing
 
     # -- the run --------------------------------------------------------------------------------
@@ -539,7 +551,12 @@ class MultiProcessRun(NativeRun):
         for child in self.children:
             if not child.is_over:
                 child.stop()
-        deadline = time.monotonic() + _KILLED_AFTER_S
+        deadline = time.monotonic() + ENDS_WITHIN_S
+        for child in self.children:
+            child.join(max(deadline - time.monotonic(), 0.1))
+            if child.is_alive():
+                child.terminate()
+        deadline = time.monotonic() + _KILLED_WITHIN_S
         for child in self.children:
             child.join(max(deadline - time.monotonic(), 0.1))
             if child.is_alive():

@@ -42,13 +42,20 @@ from rsltrace.trace.model.texts import printable
 
 def as_python(job: Job, spec: NodeSpec) -> NodeSpec:
     """Return an entry as native runs observe it: Python is run by Python code of ours, and not with
-    the library that processes of a simulation have."""
+    the library that processes of a simulation have. A command of a launch file keeps its own:
+    ``ros2 bag play`` sends from C++, and others start processes."""
     changes: dict[str, object] = {"isolated": False}
-    if spec.program is not None:
+    if spec.program is not None and spec.origin is None:
         path = job.resolve(spec.program)
         if path.is_file() and is_python(path):
             changes |= {"program": None, "script": spec.program}
     return spec.model_copy(update=changes)
+
+
+def ros_words(arguments: Sequence[RosArguments]) -> list[str]:
+    """Return the ROS arguments of a process; none if they say nothing: it may not be ROS's."""
+    said = [part.arguments for part in arguments if part.arguments != ("--ros-args",)]
+    return [word for words in said for word in words]
 
 
 class ProcessPrograms:
@@ -73,14 +80,13 @@ class ProcessPrograms:
         command = self.command(spec, where)
         if command is None:
             return None
-        words = [word for part in arguments for word in part.arguments]
         if self._library is None:
             try:
                 self._library = library(self._note)
             except SetupError as error:
                 raise JobError(str(error), where=where) from error
         return program(
-            [*command, *spec.arguments, *words],
+            [*command, *spec.arguments, *ros_words(arguments)],
             self._library,
             surroundings=self._surroundings,
             environment=spec.environment,

@@ -398,7 +398,7 @@ def last_ns(trace: Trace) -> int:
     """Return when the last callback of a native run began, or its end if that is later: processes
     do not end at once."""
     stamps = [rows["stamp"][np.isin(rows["kind"], list(CALLBACKS))] for rows in trace.events()]
-    return max(trace.end_ns, *(int(one.max()) for one in stamps if len(one)))
+    return max([trace.end_ns, *(int(one.max()) for one in stamps if len(one))])
 
 
 def definition_of(trace: Trace, type_name: str) -> tuple[str, str]:

@@ -38,7 +38,7 @@ _RENAMED = {"node_executable": "executable", "node_name": "name", "node_namespac
 
 
 class ExecuteLocal(Action):
-    """Starts another program: nothing that can be simulated."""
+    """Starts another program."""
 
     ends_run: Callable[[LaunchContext], bool] | None = None
     """Says whether the run ends with it (``required`` and ``on_exit`` in XML and YAML)."""
@@ -85,18 +85,24 @@ class ExecuteLocal(Action):
 class ExecuteProcess(ExecuteLocal):
     """Starts another program."""
 
-    def __init__(self, *, cmd: Iterable[Any], name: Any = None, **options: Any) -> None:
+    def __init__(self, *, cmd: Any, name: Any = None, shell: Any = False, **options: Any) -> None:
         super().__init__(**options)
-        self.cmd = [as_substitutions(word) for word in cmd]
+        self._shell = shell
+        self.cmd = cmd if callable(cmd) else [as_substitutions(word) for word in cmd]
 
     def execute(self, context: LaunchContext) -> None:
-        why = "other programs do not run in a simulation"
         try:
-            words = " ".join(context.text(word) for word in self.cmd)
+            command = _words(context, self.cmd)
+            if command and context.flag(self._shell):
+                command = ("/bin/sh", "-c", " ".join(command))
+            surroundings = self._surroundings(context)
         except Exception as error:  # whatever a substitution of the user's own raises
-            words = " ".join("".join(part.describe() for part in word) for word in self.cmd)
-            why += f" (nor can its command be read: {as_job_error(error, '')})"
-        context.refuse(self.where, f"process {words!r:.200}" if words else "a process", why)
+            given = () if callable(self.cmd) else self.cmd
+            words = " ".join("".join(part.describe() for part in word) for word in given)
+            why = f"its command cannot be read: {as_job_error(error, '')}"
+            context.refuse(self.where, f"process {words!r:.200}" if words else "a process", why)
+        else:
+            note(context, self, command=command, surroundings=surroundings)
         self._started(context)
 
 

@@ -92,8 +92,8 @@ void *real(const char *name) {
 // before the time of a record is read and cleared once it is there: who finds it clear sees all
 // records of before.
 //
-// If only the last records are kept, what makes entities is in a ring of its own behind the other
-// one, which is read all the time; in the other one new records take the place of the oldest.
+// If only the last records are kept, what makes entities, and a copy of what checks are about, is in a
+// ring of its own behind the other one, which is read all the time; in the other one new records take the place of the oldest.
 // `reserved` says before they do; `starts` is where the first record of each part of it begins.
 constexpr std::size_t PARTS = 256;
 
@@ -111,6 +111,7 @@ struct Head {
   std::atomic<std::int64_t> triggered_ns;  // the last message that the last records are kept for
   std::atomic<std::uint64_t> trigger;      // the id of whoever sent or got it
   std::atomic<std::uint64_t> ended;        // ENDED and the exit status, unless it was killed
+  std::atomic<std::uint64_t> unchecked;    // copies that found no room
   std::atomic<std::uint64_t> starts[PARTS];
 };
 
@@ -122,7 +123,7 @@ static_assert(sizeof(Head) <= HEAD);
 
 // What the run wants: "capacity, whether only the last records are kept, the largest message whose
 // bytes are kept", then names of topics and services, a line each: +those whose messages are kept,
-// -those whose are not, !those for which the last records are kept.
+// -those whose are not, !those for which the last records are kept, ?those that checks are about.
 struct Settings {
   std::size_t capacity = 32 << 20;
   bool keeps_last = false;
@@ -223,13 +224,25 @@ class Ring {
     head_->is_writing.store(1);
     const bool is_made = settings().keeps_last && kind <= Kind::NAME;
     if (lost_ > 0 && !is_made) {  // what follows lacks something
-      if (put(Kind::LOST, thread, 0, &lost_, sizeof lost_, nullptr, 0)) lost_ = 0;
+      if (put(false, Kind::LOST, thread, 0, &lost_, sizeof lost_, nullptr, 0)) lost_ = 0;
     }
-    if ((lost_ > 0 && !is_made) || !put(kind, thread, begun_ns, fields, fields_size, data, data_size)) {
+    if ((lost_ > 0 && !is_made) || 
+        !put(is_made, kind, thread, begun_ns, fields, fields_size, data, data_size)) {
       ++lost_;
       head_->lost.fetch_add(1);
     }
     head_->is_writing.store(0, std::memory_order_release);
+  }
+
+  // Add a copy that the run reads at once, without the data if that is too large. Half of the ring
+  // is left for what makes entities.
+  void show(Kind kind, const Fields &fields, const Data &data) {
+    const auto thread = static_cast<std::uint32_t>(syscall(SYS_gettid));
+    const std::lock_guard<std::mutex> lock(lock_);
+    const std::size_t size = data.size() > MADE / 4 ? 0 : data.size();
+    if (head_->made_written.load() - head_->made_read.load() + size > MADE / 2 ||
+        !put(true, kind, thread, 0, fields.data(), fields.size(), data.data(), size))
+      head_->unchecked.fetch_add(1);
   }
 
   void trigger(std::uint32_t id) {
@@ -238,11 +251,11 @@ class Ring {
   }
 
  private:
-  bool put(Kind kind, std::uint32_t thread, std::int64_t begun_ns, const void *fields,
-           std::size_t fields_size, const void *data, std::size_t data_size) {
+  bool put(bool is_made, Kind kind, std::uint32_t thread, std::int64_t begun_ns,
+           const void *fields, std::size_t fields_size, const void *data, std::size_t data_size) {
     const std::size_t whole = sizeof(RecordHead) + fields_size + data_size;
     const std::size_t size = (whole + 7) / 8 * 8;
-    const bool keeps_last = settings().keeps_last, is_made = keeps_last && kind <= Kind::NAME;
+    const bool keeps_last = settings().keeps_last;
     auto *ring = reinterpret_cast<std::uint8_t *>(head_) + HEAD + (is_made ? head_->capacity : 0);
     const std::size_t capacity = is_made ? MADE : head_->capacity;
     auto &written = is_made ? head_->made_written : head_->written;
@@ -302,6 +315,7 @@ struct Entity {
   bool has_type = false;
   bool keeps_data = true;
   bool is_trigger = false;
+  bool is_checked = false;
   MessageCodec type;        // of a topic, or of requests
   MessageCodec other_type;  // of responses
   std::atomic<std::uint64_t> sent{0};
@@ -339,6 +353,7 @@ Found new_entity(const void *handle, const char *name = nullptr) {
   if (name != nullptr) {
     made->keeps_data = settings().has('+', name) && !settings().has('-', name);
     made->is_trigger = settings().has('!', name);
+    made->is_checked = settings().keeps_last && settings().has('?', name);
   }
   remember(handle, made);
   return made;
@@ -408,6 +423,7 @@ void add_message(Kind kind, Fields &fields, const Entity &entity, const Data &da
                         data.size() <= settings().largest;
   fields.number(static_cast<std::uint32_t>(is_raw && has_data));
   fields.number(data.empty() ? UINT64_C(0) : rsltrace::hash64(data.data(), data.size()));
+  if (entity.is_checked && kind == Kind::SENDING) ring().show(kind, fields, data);
   add(kind, fields, begun_ns, has_data ? &data : nullptr);
   if (entity.is_trigger) ring().trigger(entity.id);
 }

@@ -71,7 +71,7 @@ class EntryStarts:
 
     def add_at(self, entry: JobEntry, time_ns: int) -> None:
         """Start an entry at a time, whatever its rule says."""
-        later = DelayedStart(self, entry, StartRule())
+        later = DelayedStart(self, entry, StartRule(), is_scheduled=True)
         self._waiting.append(later)
         self.runtime.programs.to_come.append(entry.key)
         self.runtime.loop.schedule_release(time_ns, _release, later)
@@ -96,14 +96,16 @@ class EntryStarts:
 class DelayedStart:
     """An entry that waits for its start; the loop dispatches it once."""
 
-    def __init__(self, starts: EntryStarts, entry: JobEntry, rule: StartRule) -> None:
+    def __init__(
+        self, starts: EntryStarts, entry: JobEntry, rule: StartRule, *, is_scheduled: bool = False
+    ) -> None:
         self.entry = entry
         self._starts = starts
         self._rule = rule
         conditions = ("topic", "service", "node", "started", "ended")
         self.unmet = [name for name in conditions if getattr(rule, name) is not None]
         self._cause = (NO_EVENT, 0)
-        self._scheduled = False
+        self._scheduled = is_scheduled
 
     def joined(self, member: Any) -> None:
         """Check a service or node that joined the graph."""
