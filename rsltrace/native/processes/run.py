@@ -123,11 +123,12 @@ not keep all others from the file."""
 
 
 class ProcessSpans:
-    """One process: the spans that it has sent, and up to when these are all."""
+    """One process: the spans that it has sent, up to when these are all, and when it has said so:
+    on a busy machine that is read long after it."""
 
     def __init__(self) -> None:
         self.spans: deque[CallbackSpan] = deque()
-        self.until_ns = now_ns()
+        self.until_ns = self.advanced_ns = now_ns()
         self.is_over = False
 
 
@@ -152,7 +153,8 @@ class SpanMerger:
         """Add spans in the order of their starts; no other one will begin before ``until_ns``."""
         with self._lock:
             source.spans.extend(spans)
-            source.until_ns = max(source.until_ns, until_ns)
+            if until_ns > source.until_ns:
+                source.until_ns, source.advanced_ns = until_ns, now_ns()
 
     def end(self, source: ProcessSpans) -> None:
         """Take note that nothing more comes from a source."""
@@ -178,7 +180,7 @@ class SpanMerger:
         waited = [
             source.until_ns
             for source in self._sources
-            if not source.is_over and source.until_ns > patient_ns
+            if not source.is_over and source.advanced_ns > patient_ns
         ]
         return min(waited, default=None)
 
