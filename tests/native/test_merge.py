@@ -93,6 +93,9 @@ def test_who_is_read_late_on_a_busy_machine_keeps_its_place(
     merge.add(other, [span(begun_ns + 3)], at_ns)
     merge.add(behind, [span(begun_ns + 1)], begun_ns + 2)
     assert [one.start_ns for one in merge.finished(0)] == [begun_ns + 1]
+    at_ns += 2 * merging.STALLED_NS
+    behind.is_being_read = True
+    assert merge.finished(0) == []
     merge.add(behind, [span(begun_ns + 2)], at_ns)
     assert [one.start_ns for one in merge.finished(0)] == [begun_ns + 2, begun_ns + 3]
     assert merge.late == 0

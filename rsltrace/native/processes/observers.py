@@ -143,7 +143,7 @@ def gids(extension: Any) -> PublisherGids | None:
 
 
 _EVERY_S = 0.05
-_AT_ONCE = 2_000
+_AT_ONCE = 500
 """Spans in one frame, at most."""
 
 

@@ -129,7 +129,7 @@ class ProcessSpans:
     def __init__(self) -> None:
         self.spans: deque[CallbackSpan] = deque()
         self.until_ns = self.advanced_ns = now_ns()
-        self.is_over = False
+        self.is_being_read = self.is_over = False
 
 
 class SpanMerger:
@@ -153,6 +153,7 @@ class SpanMerger:
         """Add spans in the order of their starts; no other one will begin before ``until_ns``."""
         with self._lock:
             source.spans.extend(spans)
+            source.is_being_read = False
             if until_ns > source.until_ns:
                 source.until_ns, source.advanced_ns = until_ns, now_ns()
 
@@ -180,7 +181,7 @@ class SpanMerger:
         waited = [
             source.until_ns
             for source in self._sources
-            if not source.is_over and source.advanced_ns > patient_ns
+            if not source.is_over and (source.is_being_read or source.advanced_ns > patient_ns)
         ]
         return min(waited, default=None)
 
@@ -339,6 +340,7 @@ class MultiProcessRun(NativeRun):
         spans: list[tuple[Any, ...]],
     ) -> None:
         reader, source = self._told[child]
+        source.is_being_read = True
         reader.define(definitions)
         found = [reader.span(values) for values in spans]
         self._counts[child] = counts
@@ -349,6 +351,7 @@ class MultiProcessRun(NativeRun):
         program = self._programs.get(child)
         if program is None or child not in self._told or self.last is not None:
             return
+        self._told[child][1].is_being_read = True
         try:
             found, until_ns = program.read(is_over=is_over)
         except Exception as error:
