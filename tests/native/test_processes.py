@@ -70,6 +70,21 @@ def four(
         yield trace, counted
 
 
+@pytest.mark.long
+def test_messages_of_threads_that_share_a_publisher_have_their_causes(
+    tmp_path: Path, compiled: Callable[[str], Path]
+) -> None:
+    program = compiled("../native/counting.c")
+    done = record(
+        tmp_path,
+        f"nodes: [{{program: {program}, arguments: [a, '1', '10', threads]}}]\n"
+        "stop: {duration: 3s}\n",
+    )
+    assert done.returncode == 0, done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert trace.result["unknown_causes"] == "0"
+
+
 def callbacks(trace: Trace, node: str, name: str, kind: EventKind) -> list[Any]:
     """Return the events of one entity of a node."""
     (entity,) = [
