@@ -22,7 +22,8 @@ class ObservedEntity:
     """An entity under observation.
 
     ``sends`` and ``takes`` say of what types its messages are; ``sequence`` counts what it has
-    sent, as the middleware does: only one thread sends, with ``sending``. ``node`` is its node's id.
+    sent, as the middleware does: only one thread sends, with ``sending``. ``node`` is its node's
+    id.
     """
 
     id: int

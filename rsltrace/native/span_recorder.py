@@ -129,6 +129,10 @@ class SpanRecorder:
         self.activity_ns = 0
         """When something was last sent, steady."""
 
+    def unlock(self) -> None:
+        """Go on in a forked process, where no other thread gives the lock back."""
+        self._lock = threading.Lock()
+
     def now_ns(self) -> int:
         """Read the steady clock."""
         return now_ns()

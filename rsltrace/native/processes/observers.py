@@ -174,6 +174,11 @@ class ProcessObservers:
         self._stack.enter_context(self.nodes.watched())
         self._stack.enter_context(executors.watched(threads_are_processes=False))
 
+    def forget(self) -> None:
+        """Observe nothing any more: this process is a copy of the one that was to be observed."""
+        self.recorder.unlock()
+        self._stack.close()
+
 
 class SpanSender(threading.Thread):
     """Tells the run what was observed, again and again, until ``finish``."""

@@ -322,6 +322,10 @@ class MultiProcessRun(NativeRun):
         elif what == "shutdown":
             child.has_failed = True
             self.stop(Stop(f"{child.what.name} has ended: rclpy was shut down"))
+        elif what == "forked":
+            child.forks += 1
+        elif what == "end":
+            child.has_told_all = True
         elif what == "exit":
             child.exit_text = values[0]
         elif what == "levels":
@@ -444,7 +448,7 @@ class MultiProcessRun(NativeRun):
 
     def _look_for_missing(self, child: ObservedProcess, status: int) -> None:
         """Take note of what the trace lacks, or may lack, of a process that has ended."""
-        name, program = child.what.name, self._programs.get(child)
+        what, name, program = child.what, child.what.name, self._programs.get(child)
         if program is not None and program.lost and self.last is None:
             self.lacks(f"{program.lost} records of {name}, for which there was no room")
         if program is not None and program.unobserved:
@@ -452,9 +456,16 @@ class MultiProcessRun(NativeRun):
                 f"{program.unobserved} processes of {name}, which made no file: killed before, or "
                 f"no room in {self._folder}"
             )
+        if child.forks:
+            self.lacks(f"of {name}, what {child.forks} copies did that it forked")
+        if child.has_begun and status >= 0 and not (what.order.command or child.has_told_all):
+            self.lacks(
+                f"of {name}, all after it used os._exit, became another program or closed "
+                "rsltrace's file descriptor"
+            )
         if child.has_begun and status < 0 and status != -signal.SIGINT:
-            what = "the last 50 ms" if program is None else "what each thread was just doing"
-            self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
+            lost = "the last 50 ms" if program is None else "what each thread was just doing"
+            self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {lost}")
 
     @property
     def _at(self) -> str:
