@@ -136,8 +136,8 @@ class MessageObserver:
             if entity is None:
                 original(handle, message)
                 return
-            sequence = next(entity.sequence)
-            with self._sending() as span:
+            with self._sending() as span, entity.sending:
+                sequence = next(entity.sequence)
                 before_ns = time.time_ns()
                 begun_ns -= now_ns()
                 try:

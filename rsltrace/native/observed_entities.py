@@ -22,7 +22,8 @@ class ObservedEntity:
     """An entity under observation.
 
     ``sends`` and ``takes`` say of what types its messages are; ``sequence`` counts what it has
-    sent. ``node`` is its node's id.
+    sent, as the middleware does: only one thread sends, with ``sending``. ``node`` is its node's
+    id.
     """
 
     id: int
@@ -36,6 +37,7 @@ class ObservedEntity:
     gid: bytes = b""
     """A publisher's in the middleware, empty where nobody has asked."""
     sequence: count[int] = field(default_factory=lambda: count(1))
+    sending: Any = field(default_factory=threading.RLock, compare=False, repr=False)
 
 
 class ObservedEntities:

@@ -130,6 +130,10 @@ class SpanRecorder:
         """When something was last sent, steady."""
         self.until_ns = 0
 
+    def unlock(self) -> None:
+        """Go on in a forked process, where no other thread gives the lock back."""
+        self._lock = threading.Lock()
+
     def now_ns(self) -> int:
         """Read the steady clock."""
         return now_ns()

@@ -1,7 +1,8 @@
 // The node of robot_mains:count on rcl: it publishes numbers and a text that all others publish, too,
 // and writes down what it has sent and got.
 //
-// Usage: counting [where to write] [first number] [period in ms]
+// Usage: counting [where to write] [first number] [period in ms] [threads: eight publish, too]
+#include <pthread.h>
 #include <rcl/error_handling.h>
 #include <rcl/rcl.h>
 #include <rosidl_runtime_c/string_functions.h>
@@ -36,6 +37,12 @@ static void on_timer(rcl_timer_t *timer, int64_t since_last) {
   number.data = next++;
   CHECK(rcl_publish(&out, &number, NULL));
   CHECK(rcl_publish(&say, &text, NULL));
+}
+
+static void *publish(void *from) {
+  std_msgs__msg__UInt64 own = {(uint64_t)from};
+  for (int i = 0; i < 2000; i++, own.data++) CHECK(rcl_publish(&out, &own, NULL));
+  return NULL;
 }
 
 int main(int argc, const char **argv) {
@@ -73,6 +80,10 @@ int main(int argc, const char **argv) {
   CHECK(rcl_wait_set_init(&set, 2, 0, 1, 0, 0, 0, &context, allocator));
   signal(SIGINT, end);
 
+  pthread_t threads[8] = {0};
+  for (int i = 0; argc > 4 && i < 8; i++)
+    pthread_create(&threads[i], NULL, publish, (void *)(uintptr_t)(1000000 * (i + 1)));
+
   static uint64_t got[1 << 20];
   size_t count = 0, same = 0;
   std_msgs__msg__UInt64 message;
@@ -90,6 +101,7 @@ int main(int argc, const char **argv) {
       got[count++] = message.data;
     if (set.subscriptions[1] != NULL && rcl_take(&in[1], &other, NULL, NULL) == RCL_RET_OK) same++;
   }
+  for (int i = 0; argc > 4 && i < 8; i++) pthread_join(threads[i], NULL);
   FILE *file = fopen(argv[1], "w");
   fprintf(file, "{\"sent\": %lu, \"same\": %lu, \"got\": [", next - first, same);
   for (size_t i = 0; i < count; i++) fprintf(file, i == 0 ? "%lu" : ", %lu", got[i]);

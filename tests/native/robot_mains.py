@@ -81,6 +81,24 @@ def crash() -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
+def fork() -> None:
+    """Fork, and be a node in both processes."""
+    copy = os.fork()
+    rclpy.init()
+    publisher = Node("fork").create_publisher(UInt64, "/numbers", 10)
+    publisher.publish(UInt64(data=copy == 0))
+    time.sleep(0.1)
+    if copy:
+        os.waitpid(copy, 0)
+
+
+def become() -> None:
+    """Become another program."""
+    rclpy.init()
+    Node("become")
+    os.execvp("true", ["true"])
+
+
 def fail() -> None:
     rclpy.init()
     Node("fail")

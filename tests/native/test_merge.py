@@ -82,6 +82,25 @@ def test_who_stands_still_does_not_keep_them_for_ever(monkeypatch: pytest.Monkey
     assert merge.late == 1
 
 
+def test_who_is_read_late_on_a_busy_machine_keeps_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    merge = SpanMerger()
+    behind, other = merge.source(), merge.source()
+    begun_ns = now_ns()
+    at_ns = begun_ns + 2 * merging.STALLED_NS
+    monkeypatch.setattr(merging, "now_ns", lambda: at_ns)
+    merge.add(other, [span(begun_ns + 3)], at_ns)
+    merge.add(behind, [span(begun_ns + 1)], begun_ns + 2)
+    assert [one.start_ns for one in merge.finished(0)] == [begun_ns + 1]
+    at_ns += 2 * merging.STALLED_NS
+    behind.is_being_read = True
+    assert merge.finished(0) == []
+    merge.add(behind, [span(begun_ns + 2)], at_ns)
+    assert [one.start_ns for one in merge.finished(0)] == [begun_ns + 2, begun_ns + 3]
+    assert merge.late == 0
+
+
 def test_spans_are_the_same_on_the_other_side() -> None:
     log = pytest.importorskip("rcl_interfaces.msg").Log
     recorder = SpanRecorder()

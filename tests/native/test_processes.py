@@ -71,6 +71,21 @@ def four(
         yield trace, counted
 
 
+@pytest.mark.long
+def test_messages_of_threads_that_share_a_publisher_have_their_causes(
+    tmp_path: Path, compiled: Callable[[str], Path]
+) -> None:
+    program = compiled("../native/counting.c")
+    done = record(
+        tmp_path,
+        f"nodes: [{{program: {program}, arguments: [a, '1', '10', threads]}}]\n"
+        "stop: {duration: 3s}\n",
+    )
+    assert done.returncode == 0, done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert trace.result["unknown_causes"] == "0"
+
+
 def callbacks(trace: Trace, node: str, name: str, kind: EventKind) -> list[Any]:
     """Return the events of one entity of a node."""
     (entity,) = [
@@ -350,6 +365,18 @@ def is_gone(number: int) -> bool:
 
 
 DEAF = "nodes: [{main: robot_mains:deaf, arguments: [pid]}, {node: robot:Talker}]\n"
+
+
+def test_what_cannot_be_observed_of_a_process_is_named(tmp_path: Path) -> None:
+    done = record(tmp_path, "nodes: [{main: robot_mains:fork}, {main: robot_mains:become}]\n")
+    assert done.returncode == 0, done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert set(trace.result["missing"].split("; ")) == {
+            "of robot_mains:fork, what 1 copies did that it forked",
+            "of robot_mains:become, all after it used os._exit, became another program or closed "
+            "rsltrace's file descriptor",
+        }
+        assert [data[4:] for _, _, data in trace.messages("/numbers")] == [bytes(8)]
 
 
 def test_ctrl_c_ends_all_processes_even_one_that_does_not_listen(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import os
 import random
 import signal
 import threading
+import time
+from itertools import count
 from unittest.mock import MagicMock
 
 import pytest
@@ -100,6 +102,49 @@ def test_an_interrupt_waits_until_what_was_sent_is_noted() -> None:
     recorder.end()
     (span,) = recorder.finished(LONG_NS)
     assert [one.entity for one in span.outputs if isinstance(one, SentMessage)] == [topic]
+
+
+def test_threads_that_share_a_publisher_count_as_the_middleware_does() -> None:
+    from std_msgs.msg import String
+
+    left: list[str] = []
+
+    class Publisher:
+        def publish(self, message: object) -> None:
+            left.append(message.data)  # type: ignore[attr-defined]
+
+        publish_raw = publish
+
+    class Slow:
+        """Gives numbers, and then lets other threads run."""
+
+        numbers = count(1)
+
+        def __next__(self) -> int:
+            number = next(self.numbers)
+            time.sleep(1e-4)
+            return number
+
+    recorder = SpanRecorder()
+    entities = ObservedEntities(lambda _: None)
+    with MessageObserver(recorder, entities).watched(MagicMock(Publisher=Publisher)):
+        handle = Publisher()
+        topic = entities.add((handle,), None, EntityKind.PUBLISHER, "/topic")
+        topic.sends_type, topic.sequence = String, Slow()  # type: ignore[assignment]
+        threads = [
+            threading.Thread(target=lambda n=n: handle.publish(String(data=str(n))))
+            for n in range(50)
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    sent = [one for span in recorder.finished(None) for one in span.outputs]
+    assert all(isinstance(one, SentMessage) for one in sent)
+    numbered = sorted((one.sequence, one.data) for one in sent if isinstance(one, SentMessage))
+    assert [number for number, _ in numbered] == list(range(1, 51))
+    for text, (_, data) in zip(left, numbered, strict=True):
+        assert f"{text}\0".encode() in data
 
 
 def test_what_a_thread_of_the_users_sends_is_an_event_of_its_own() -> None:

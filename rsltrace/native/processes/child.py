@@ -176,6 +176,7 @@ class _EntryProcess:
         self._priorities: Priorities | None = None
         self._is_over = threading.Event()
         atexit.register(self._finish)  # runs last: what others register comes before
+        os.register_at_fork(after_in_parent=self._forked, after_in_child=self._forget)
 
     def run(self, stack: ExitStack) -> int:
         """Run the entry; return the exit status of the process."""
@@ -275,6 +276,16 @@ class _EntryProcess:
                 self._link.send("stuck")
             os._exit(0)
 
+    def _forked(self) -> None:
+        with suppress(OSError):
+            self._link.send("forked")
+
+    def _forget(self) -> None:
+        """Be a process that the run does not know: its connection is the parent's."""
+        self._sender = self._priorities = None
+        self._link.close()
+        self._observers.forget()
+
     def _finish(self) -> None:
         self._is_over.set()
         if self._sender is not None:
@@ -282,6 +293,8 @@ class _EntryProcess:
         if self._priorities is not None:
             with suppress(OSError):
                 self._link.send("levels", dict(self._priorities.levels))
+        with suppress(OSError):
+            self._link.send("end")
 
 
 if __name__ == "__main__":

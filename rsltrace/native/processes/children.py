@@ -64,6 +64,8 @@ class ObservedProcess(threading.Thread):
         self.has_begun = False
         self.has_failed = False
         """Whether it has said itself what went wrong."""
+        self.has_told_all = False
+        self.forks = 0
         self.is_stopping = False
         self.is_stuck = False
         self.exit_text = ""
@@ -115,7 +117,8 @@ class ObservedProcess(threading.Thread):
         self._link.close()
 
     def _status(self) -> int:
-        if self.what.order.command:  # it has let go of the socket to become something else
+        if self.what.order.command or (self.has_begun and not self.has_told_all):
+            # it has let go of the socket: to become something else, or with all that it had open
             while (status := self._process.poll()) is None:
                 self._told(self, ("look",))
                 time.sleep(_LOOK_AT_PROGRAMS_S)

@@ -143,7 +143,7 @@ def gids(extension: Any) -> PublisherGids | None:
 
 
 _EVERY_S = 0.05
-_AT_ONCE = 2_000
+_AT_ONCE = 500
 """Spans in one frame, at most."""
 
 
@@ -173,6 +173,11 @@ class ProcessObservers:
         self._stack.enter_context(self.message_observer.watched(self._extension))
         self._stack.enter_context(self.nodes.watched())
         self._stack.enter_context(executors.watched(threads_are_processes=False))
+
+    def forget(self) -> None:
+        """Observe nothing any more: this process is a copy of the one that was to be observed."""
+        self.recorder.unlock()
+        self._stack.close()
 
 
 class SpanSender(threading.Thread):

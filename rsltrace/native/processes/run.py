@@ -123,12 +123,13 @@ not keep all others from the file."""
 
 
 class ProcessSpans:
-    """One process: the spans that it has sent, and up to when these are all."""
+    """One process: the spans that it has sent, up to when these are all, and when it has said so:
+    on a busy machine that is read long after it."""
 
     def __init__(self) -> None:
         self.spans: deque[CallbackSpan] = deque()
-        self.until_ns = now_ns()
-        self.is_over = False
+        self.until_ns = self.advanced_ns = now_ns()
+        self.is_being_read = self.is_over = False
 
 
 class SpanMerger:
@@ -153,7 +154,9 @@ class SpanMerger:
         """Add spans in the order of their starts; no other one will begin before ``until_ns``."""
         with self._lock:
             source.spans.extend(spans)
-            source.until_ns = max(source.until_ns, until_ns)
+            source.is_being_read = False
+            if until_ns > source.until_ns:
+                source.until_ns, source.advanced_ns = until_ns, now_ns()
 
     def end(self, source: ProcessSpans) -> None:
         """Take note that nothing more comes from a source."""
@@ -181,7 +184,7 @@ class SpanMerger:
         waited = [
             source.until_ns
             for source in self._sources
-            if not source.is_over and source.until_ns > patient_ns
+            if not source.is_over and (source.is_being_read or source.advanced_ns > patient_ns)
         ]
         return min(waited, default=None)
 
@@ -322,6 +325,10 @@ class MultiProcessRun(NativeRun):
         elif what == "shutdown":
             child.has_failed = True
             self.stop(Stop(f"{child.what.name} has ended: rclpy was shut down"))
+        elif what == "forked":
+            child.forks += 1
+        elif what == "end":
+            child.has_told_all = True
         elif what == "exit":
             child.exit_text = values[0]
         elif what == "levels":
@@ -340,6 +347,7 @@ class MultiProcessRun(NativeRun):
         spans: list[tuple[Any, ...]],
     ) -> None:
         reader, source = self._told[child]
+        source.is_being_read = True
         reader.define(definitions)
         found = [reader.span(values) for values in spans]
         self._counts[child] = counts
@@ -350,6 +358,7 @@ class MultiProcessRun(NativeRun):
         program = self._programs.get(child)
         if program is None or child not in self._told or self.last is not None:
             return
+        self._told[child][1].is_being_read = True
         try:
             found, until_ns = program.read(is_over=is_over)
         except Exception as error:
@@ -442,15 +451,22 @@ class MultiProcessRun(NativeRun):
 
     def _look_for_missing(self, child: ObservedProcess, status: int) -> None:
         """Take note of what the trace lacks, or may lack, of a process that has ended."""
-        name, program = child.what.name, self._programs.get(child)
+        what, name, program = child.what, child.what.name, self._programs.get(child)
         if program is not None and program.lost and self.last is None:
             self.lacks(f"{program.lost} records of {name}, for which there was no room")
         if program is not None and self.last is None:
             for text in self._without_file(child, program):
                 self.lacks(text)
+        if child.forks:
+            self.lacks(f"of {name}, what {child.forks} copies did that it forked")
+        if child.has_begun and status >= 0 and not (what.order.command or child.has_told_all):
+            self.lacks(
+                f"of {name}, all after it used os._exit, became another program or closed "
+                "rsltrace's file descriptor"
+            )
         if child.has_begun and status < 0 and status != -signal.SIGINT:
-            what = "the last 50 ms" if program is None else "what each thread was just doing"
-            self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
+            lost = "the last 50 ms" if program is None else "what each thread was just doing"
+            self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {lost}")
 
     def _without_file(self, child: ObservedProcess, program: ObservedProgram) -> Iterator[str]:
         if child.is_over and program.unobserved:

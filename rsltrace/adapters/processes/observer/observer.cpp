@@ -318,7 +318,8 @@ struct Entity {
   bool is_checked = false;
   MessageCodec type;        // of a topic, or of requests
   MessageCodec other_type;  // of responses
-  std::atomic<std::uint64_t> sent{0};
+  std::recursive_mutex publishing;  // threads that share a publisher: it counts as the middleware
+  std::int64_t sent = 0;
 };
 
 using Found = std::shared_ptr<Entity>;
@@ -453,7 +454,8 @@ rmw_ret_t send(Sent kind, const Found &from, const Data &data, bool is_raw, std:
 template <typename Send>
 rmw_ret_t publish(const Found &from, const Data &data, bool is_raw, std::int64_t begun_ns,
                   Send really) {
-  const auto number = static_cast<std::int64_t>(++from->sent);
+  const std::lock_guard<std::recursive_mutex> lock(from->publishing);
+  const std::int64_t number = ++from->sent;
   const rmw_ret_t status = send(Sent::MESSAGE, from, data, is_raw, begun_ns, &number, really);
   if (status != RMW_RET_OK) --from->sent;  // the middleware has not counted it
   return status;
