@@ -45,8 +45,8 @@ def wait_until(condition: Callable[[], bool], run: subprocess.Popen[str] | None 
     """Wait until a condition is met, while a run goes on."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
-        is_over = run is not None and run.poll() is not None
-        assert not (is_over or time.monotonic() > deadline), run and run.communicate()
+        assert run is None or run.poll() is None, run.communicate()
+        assert time.monotonic() < deadline
         time.sleep(0.05)
 
 

@@ -187,7 +187,8 @@ def test_nothing_claims_that_it_repeats(graph: tuple[Trace, str], command: Any) 
 
 def test_diff_tells_content_from_timing(tmp_path: Path, command: Any) -> None:
     """The nodes answer each other, so that all runs say the same, whatever the times."""
-    plain = "nodes: [{node: robot:Counter}, {node: robot:Listener}]\nstop: {topic: /over, timeout: 300s}\n"
+    nodes = "nodes: [{node: robot:Counter}, {node: robot:Listener}]"
+    plain = f"{nodes}\nstop: {{topic: /over, timeout: 300s}}\n"
     assert record(tmp_path, plain).returncode == 0
     os.rename(tmp_path / "run.mcap", tmp_path / "native.mcap")
     other = record(tmp_path, plain.replace("Counter}", "Counter, arguments: {first: 1000}}"))

@@ -177,7 +177,11 @@ nodes:
   - {node: robot:Nested, remappings: {/done: /nested}, start_after: {topic: /heard}}
   - {node: robot:Asker, start_after: {topic: /nested}}
   - {main: robot_mains:talk, arguments: [5], start_after: {service: /ask, delay: 200ms}}
-  - {main: robot_mains:talk, arguments: [3], name: last, start_after: {ended: 5, topic: /done}, required: true}
+  - main: robot_mains:talk
+    arguments: [3]
+    name: last
+    start_after: {ended: 5, topic: /done}
+    required: true
 stop: {timeout: 300s}
 """
     done = record(tmp_path, text, "--processes", "--executor", "multi")

@@ -14,7 +14,7 @@ from rsltrace import replay
 from rsltrace.errors import ReplayError
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
-from tests.native.running import COMMAND, environment
+from tests.native.running import COMMAND, PATIENCE_S, environment
 
 pytestmark = [
     pytest.mark.ros,
@@ -129,7 +129,7 @@ def recorded(folder: Path, server: str, *words: str) -> None:
     (folder / "serving.py").write_text("import mixing\nmixing.serve()\n")
     (folder / "job.yaml").write_text(JOB.replace("SERVER", server))
     started = [*COMMAND, "record", "--native", "job.yaml", "-o", "native.mcap", "-q", *words]
-    subprocess.run(started, cwd=folder, env=environment(folder), check=True, timeout=300)
+    subprocess.run(started, cwd=folder, env=environment(folder), check=True, timeout=PATIENCE_S)
 
 
 def middle_of_mixed(path: str) -> int:
