@@ -99,6 +99,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture
+def own_domain() -> Iterator[None]:
+    """A DDS domain that no other test and nobody else on this machine is in."""
+    from rsltrace.native.support import domain
+
+    with domain(None):
+        yield
+
+
+@pytest.fixture
 def command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., subprocess.CompletedProcess[str]]:

@@ -97,7 +97,7 @@ class Gate(CallbackGroup):
 
 def spin(executor: Executor, node: Node, until: Any) -> None:
     executor.add_node(node)
-    give_up = time.monotonic() + 30
+    give_up = time.monotonic() + 240
     while not until() and time.monotonic() < give_up:
         executor.spin_once(timeout_sec=0.1)
     executor.remove_node(node)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -45,10 +44,10 @@ def test_in_the_users_own_executors(simulate: Any, capfd: Any) -> None:
 
 
 @pytest.mark.native
+@pytest.mark.usefixtures("own_domain")
 def test_in_rclpy_itself() -> None:
-    env = {**os.environ, "ROS_DOMAIN_ID": "87"}
     done = subprocess.run(
-        [sys.executable, PROGRAM], capture_output=True, text=True, check=True, env=env, timeout=300
+        [sys.executable, PROGRAM], capture_output=True, text=True, check=True, timeout=1200
     )
     assert told(done.stdout) == EXPECTED
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -85,13 +84,11 @@ def test_that_order_can_be_replayed(simulate: Any, tmp_path: Path, policy: Any) 
 
 
 @pytest.mark.native
+@pytest.mark.usefixtures("own_domain")
 def test_rclpy_itself_has_that_order(simulate: Any, capfd: Any) -> None:
     seeds = [str(seed) for seed in range(30)]
-    environment = {**os.environ, "ROS_DOMAIN_ID": "88"}
     command = [sys.executable, str(PROGRAM), *seeds]
-    natively = subprocess.run(
-        command, capture_output=True, text=True, check=True, env=environment, timeout=900
-    )
+    natively = subprocess.run(command, capture_output=True, text=True, check=True, timeout=1800)
     simulate(NodeSpec(script=PROGRAM, arguments=seeds), job={"policy": "rclpy"})
     assert orders(capfd.readouterr().out) == orders(natively.stdout)
     if not _run_oldest_first():

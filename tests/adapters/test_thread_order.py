@@ -54,17 +54,24 @@ def test_threads_take_turns_as_natively(simulate: Any, capfd: Any) -> None:
     assert len(here) == 22
     assert here["start"] == ["child", "parent"]
     assert here["start_new_thread"] == ["parent", "child"]
-    natively, _ = run_natively(1)
-    assert natively == here
+    left = dict(here)
+    for _ in range(10):  # a machine that stands still for a moment lets sleeps go by
+        natively, _ = run_natively(1)
+        left = {name: order for name, order in left.items() if natively[name] != order}
+        if not left:
+            return
+    pytest.fail(f"natively this is otherwise: {left}, for example {natively}")
 
 
 @pytest.mark.native  # on a busy machine the kernel may decide otherwise for minutes
 def test_what_the_kernel_decides_happens_natively() -> None:
-    for _ in range(10):
+    left = dict(MOST_OFTEN)
+    for _ in range(30):
         _, rounds = run_natively(40)
-        if all(order in rounds[name] for name, order in MOST_OFTEN.items()):
+        left = {name: order for name, order in left.items() if order not in rounds[name]}
+        if not left:
             return
-    pytest.fail(f"natively this does not happen: {rounds}")
+    pytest.fail(f"natively this does not happen: {left}")
 
 
 def test_a_thread_that_is_started_in_a_callback(simulate: Any) -> None:

@@ -2,7 +2,8 @@
 
 The same two nodes run natively over DDS (in two processes: within one, Fast DDS loses sight of
 automatic liveliness) and under rsltrace, and what each end of each pair went through has to be the
-same. Every pair has a topic of its own. Natively: ``python qos_matrix.py NODE SEED COUNT START``.
+same. Every pair has a topic of its own. Natively: ``python qos_matrix.py NODE SEED COUNT START
+SLOWER``; all takes so many times longer, for busy machines.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from rclpy.qos import (
 from std_msgs.msg import UInt64
 
 MS = 1_000_000
+SLOWER = int(sys.argv[5]) if __name__ == "__main__" else 1
 CHOICES: dict[str, list[Any]] = {
     "reliability": ["RELIABLE", "BEST_EFFORT"],
     "durability": ["VOLATILE", "TRANSIENT_LOCAL"],
@@ -67,7 +69,7 @@ def profile(values: dict[str, Any]) -> QoSProfile:
     """Return the QoS profile of some values."""
     history, depth = values["history"]
     limits = {
-        key: Duration(nanoseconds=values[name] * MS)
+        key: Duration(nanoseconds=values[name] * MS * SLOWER)
         for name, key in (
             ("deadline", "deadline"),
             ("lifespan", "lifespan"),
@@ -171,7 +173,7 @@ class _Timeline(Node):  # type: ignore[misc]
             timer.cancel()
             action()
 
-        timer = self.create_timer(after_s, act)
+        timer = self.create_timer(after_s * SLOWER, act)
 
     def _look(self) -> None:
         for end in self.ends:
@@ -213,7 +215,7 @@ def main() -> None:
     import rclpy
     from rclpy.experimental import EventsExecutor
 
-    name, seed, count, start = sys.argv[1:]
+    name, seed, count, start = sys.argv[1:5]
     rclpy.init()
     time.sleep(max(float(start) - time.time(), 0))
     node = {"offers": Offers, "asks": Asks}[name](int(seed), int(count))
@@ -221,7 +223,7 @@ def main() -> None:
     executor.add_node(node)
     while not node.done:
         executor.spin_once(timeout_sec=0.1)
-    time.sleep(0.5)  # the other end must not see this one go before it is done itself
+    time.sleep(0.5 * SLOWER)  # the other end must not see this one go before it is done itself
     print(json.dumps(node.outcomes), flush=True)
     os._exit(0)
 

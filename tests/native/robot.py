@@ -2,6 +2,7 @@
 
 import os
 import threading
+from collections import Counter as Counts
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,13 @@ from test_msgs.action import Fibonacci
 
 DONE: set[str] = set()
 """Who has published on /done."""
+HEARD = Counts({"/numbers": 0, "/same": 0})
+"""How many messages listeners have got."""
 
 
 def finished(progress: Any) -> bool:
-    """End a run when everybody has done what they do once, and some more callbacks have run."""
-    return progress.events > 400 and {"asker", "nested"} <= DONE
+    """End a run when everybody has done what they do once, and listeners have heard a lot."""
+    return min(HEARD.values()) > 50 and {"asker", "nested"} <= DONE
 
 
 class Talker(Node):
@@ -27,8 +30,8 @@ class Talker(Node):
 
     def __init__(self, offset: int = 0) -> None:
         super().__init__(f"talker{offset}")
-        self.numbers = self.create_publisher(UInt64, "/numbers", 10)
-        self.same = self.create_publisher(String, "/same", 10)
+        self.numbers = self.create_publisher(UInt64, "/numbers", 1000)
+        self.same = self.create_publisher(String, "/same", 1000)
         self.count = offset
         self.create_timer(self.declare_parameter("period", 0.02).value, self.on_timer)
 
@@ -66,17 +69,18 @@ class Listener(Node):
 
     def __init__(self) -> None:
         super().__init__("listener")
-        self.echo = self.create_publisher(UInt64, "/echo", 10)
-        self.create_subscription(UInt64, "/numbers", self.on_number, 10)
-        self.create_subscription(String, "/same", self.on_same, 10)
+        self.echo = self.create_publisher(UInt64, "/echo", 1000)
+        self.create_subscription(UInt64, "/numbers", self.on_number, 1000)
+        self.create_subscription(String, "/same", self.on_same, 1000)
 
     def on_number(self, message: UInt64) -> None:
+        HEARD["/numbers"] += 1
         self.echo.publish(message)
         if message.data == 3:
             self.get_logger().warning("three")
 
     def on_same(self, message: String) -> None:
-        pass
+        HEARD["/same"] += 1
 
 
 class Server(Node):

@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,15 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from std_msgs.msg import String, UInt64
+
+DEPTH = 10_000
+"""Nobody loses a message, however long it is not its turn."""
+ENOUGH = 21
+
+
+def all_heard(progress: Any) -> bool:
+    """End a run when each of four nodes that count has heard enough of each."""
+    return all(Path(f"{number}.heard").exists() for number in range(1, 5))
 
 
 class Counting(Node):
@@ -23,11 +33,12 @@ class Counting(Node):
         super().__init__(name)
         self.first = self.next = self.declare_parameter("first", first).value
         self.got: list[int] = []
+        self.of_each: Counter[int] = Counter()
         self.same = 0
-        self.out = self.create_publisher(UInt64, "/numbers", 100)
-        self.say = self.create_publisher(String, "/same", 100)
-        self.create_subscription(UInt64, "/numbers", self.on_number, 100)
-        self.create_subscription(String, "/same", self.on_same, 100)
+        self.out = self.create_publisher(UInt64, "/numbers", DEPTH)
+        self.say = self.create_publisher(String, "/same", DEPTH)
+        self.create_subscription(UInt64, "/numbers", self.on_number, DEPTH)
+        self.create_subscription(String, "/same", self.on_same, DEPTH)
         self.create_timer(self.declare_parameter("period", 0.01).value, self.on_timer)
 
     def on_timer(self) -> None:
@@ -37,6 +48,9 @@ class Counting(Node):
 
     def on_number(self, message: UInt64) -> None:
         self.got.append(message.data)
+        self.of_each[message.data // 100_000] += 1
+        if len(self.of_each) == 4 and min(self.of_each.values()) == ENOUGH:
+            Path(f"{self.first // 100_000}.heard").touch()
 
     def on_same(self, message: String) -> None:
         self.same += 1
@@ -74,10 +88,13 @@ def talk() -> None:
 
 
 def crash() -> None:
-    """Be killed in the middle of something."""
+    """Be killed in the middle of something, once somebody says /same."""
     rclpy.init()
-    Node("crash").create_publisher(String, "/last_words", 10).publish(String(data="farewell"))
-    time.sleep(0.5)
+    node, heard = Node("crash"), []
+    node.create_publisher(String, "/last_words", 10).publish(String(data="farewell"))
+    node.create_subscription(String, "/same", heard.append, 10)
+    while not heard:
+        rclpy.spin_once(node)
     os.kill(os.getpid(), signal.SIGSEGV)
 
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rsltrace.trace.reader import Trace
 
 ROBOT = Path(__file__).parent
+PATIENCE_S = 600
+"""How long a test waits for what has to happen, however busy the machine is."""
 COMMAND = [sys.executable, "-m", "rsltrace"]
 
 
@@ -33,8 +37,17 @@ def record(folder: Path, text: str, *words: str) -> subprocess.CompletedProcess[
         env=environment(folder),
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=PATIENCE_S,
     )
+
+
+def wait_until(condition: Callable[[], bool], run: subprocess.Popen[str] | None = None) -> None:
+    """Wait until a condition is met, while a run goes on."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert run is None or run.poll() is None, run.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def events_of(trace: Trace) -> list[Any]:

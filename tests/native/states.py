@@ -23,11 +23,18 @@ STEPS = (
 
 
 class Managed(LifecycleNode):
-    """Publishes once each time it is activated."""
+    """Publishes once each time it is activated, and on ``/found`` once its manager hears it."""
 
     def __init__(self) -> None:
         super().__init__("managed")
         self.sender = self.create_lifecycle_publisher(Float64, "/level", 10)
+        self.found = self.create_publisher(Bool, "/found", 10)
+        self.timer = self.create_timer(0.1, self.look)
+
+    def look(self) -> None:
+        if self.found.get_subscription_count():
+            self.timer.cancel()
+            self.found.publish(Bool(data=True))
 
     def on_activate(self, state: Any) -> TransitionCallbackReturn:
         done = super().on_activate(state)
@@ -66,13 +73,16 @@ class Manager(Node):
         self.other = self.create_client(GetState, "/by_hand")
         self.over = self.create_publisher(Bool, "/over", 10)
         self.create_subscription(TransitionEvent, "/managed/transition_event", self.hear, 10)
+        # The last that it makes: who sees it has seen the others.
+        self.create_subscription(Bool, "/found", self.begin, 10)
         self.timer = self.create_timer(0.1, self.look)
-        self.looks = 0
+        self.timer.cancel()
+
+    def begin(self, message: Bool) -> None:
+        self.timer.reset()
 
     def look(self) -> None:
-        is_ready = self.changes.service_is_ready() and self.other.service_is_ready()
-        self.looks = self.looks + 1 if is_ready else 0
-        if self.looks == 10:  # topics have found each other, too
+        if self.changes.service_is_ready() and self.other.service_is_ready():
             self.timer.cancel()
             self.go_on(None)
 

@@ -28,7 +28,7 @@ def rsltrace(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
         env={**os.environ, "ROS_LOG_DIR": str(folder / "log")},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     return done
@@ -40,7 +40,7 @@ def test_a_native_run_becomes_a_simulation_with_its_latencies(tmp_path: Path) ->
     pytest.importorskip("scipy")
     (tmp_path / "pipeline.py").write_text((PIPELINE / "pipeline.py").read_text())
     job = (PIPELINE / "job.yaml").read_text()
-    job = job.replace("duration: 60s", "events: 300\n  timeout: 120s")
+    job = job.replace("duration: 60s", "events: 300\n  timeout: 300s")
     (tmp_path / "job.yaml").write_text(job)
     for name in ("first", "second"):
         rsltrace(tmp_path, "record", "--native", "job.yaml", "-o", f"{name}.mcap")

@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +20,15 @@ from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.native import callback_figures, is_native, timings
 from rsltrace.trace.reader import Trace
-from tests.native.running import COMMAND, environment, events_of, job, record
+from tests.native.running import (
+    COMMAND,
+    PATIENCE_S,
+    environment,
+    events_of,
+    job,
+    record,
+    wait_until,
+)
 
 pytestmark = [
     pytest.mark.ros,
@@ -49,7 +56,7 @@ nodes:
   - node: robot:Asker
   - node: robot:Nested
 seed: 7
-stop: {function: robot:finished, timeout: 120s}
+stop: {function: robot:finished, timeout: 300s}
 """
 
 
@@ -180,7 +187,8 @@ def test_nothing_claims_that_it_repeats(graph: tuple[Trace, str], command: Any) 
 
 def test_diff_tells_content_from_timing(tmp_path: Path, command: Any) -> None:
     """The nodes answer each other, so that all runs say the same, whatever the times."""
-    plain = "nodes: [{node: robot:Counter}, {node: robot:Listener}]\nstop: {topic: /over}\n"
+    nodes = "nodes: [{node: robot:Counter}, {node: robot:Listener}]"
+    plain = f"{nodes}\nstop: {{topic: /over, timeout: 300s}}\n"
     assert record(tmp_path, plain).returncode == 0
     os.rename(tmp_path / "run.mcap", tmp_path / "native.mcap")
     other = record(tmp_path, plain.replace("Counter}", "Counter, arguments: {first: 1000}}"))
@@ -242,13 +250,9 @@ def test_ctrl_c_ends_it_properly_even_if_a_callback_is_stuck(tmp_path: Path) -> 
         text=True,
     )
     try:
-        deadline = time.monotonic() + 120
-        while not (tmp_path / "stuck").exists():
-            assert time.monotonic() < deadline
-            assert process.poll() is None
-            time.sleep(0.05)
+        wait_until((tmp_path / "stuck").exists, process)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=120)
+        _, said = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
         process.wait()

@@ -24,7 +24,7 @@ JOB = f"""
 search_path: ['{Path(__file__).parent}']
 nodes: [{{node: urgent:Backlog}}]
 policy: {{priority: [{{entity: middle, priority: 30}}, {{entity: slow, priority: 20}}]}}
-stop: {{function: urgent:finished, timeout: 120s}}
+stop: {{function: urgent:finished, timeout: 300s}}
 """
 
 

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +21,16 @@ from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.trace.native import callback_figures, timings
 from rsltrace.trace.reader import Trace
-from tests.native.running import COMMAND, ROBOT, environment, events_of, job, record
+from tests.native.running import (
+    COMMAND,
+    PATIENCE_S,
+    ROBOT,
+    environment,
+    events_of,
+    job,
+    record,
+    wait_until,
+)
 from tests.processes.conftest import compiled
 
 __all__ = ["compiled"]
@@ -39,7 +47,7 @@ nodes:
   - {main: robot_mains:count, arguments: [b], name: b, parameters: {first: 200000}}
   - {main: robot_mains:count, arguments: [c], name: c, parameters: {first: 300000, period: 0.013}}
   - {main: robot_mains:count, arguments: [d], name: d, parameters: {first: 400000, period: 0.1}}
-stop: {duration: 4s}
+stop: {function: robot_mains:all_heard, timeout: 300s}
 """
 
 
@@ -49,7 +57,7 @@ nodes:
   - {program: PROGRAM, arguments: [b, "200000", "10"], name: b}
   - {program: PROGRAM, arguments: [c, "300000", "13"], name: c}
   - {main: robot_mains:count, arguments: [d], name: d, parameters: {first: 400000, period: 0.1}}
-stop: {duration: 4s}
+stop: {function: robot_mains:all_heard, timeout: 300s}
 """
 
 
@@ -183,11 +191,15 @@ nodes:
   - {node: robot:Talker, name: fast, parameters: {period: 0.01}}
   - {node: robot:Listener, remappings: {/echo: /heard}, start_after: {topic: /same}}
   - node: robot:Server
-  - node: robot:Asker
-  - node: robot:Nested
+  - {node: robot:Nested, remappings: {/done: /nested}, start_after: {topic: /heard}}
+  - {node: robot:Asker, start_after: {topic: /nested}}
   - {main: robot_mains:talk, arguments: [5], start_after: {service: /ask, delay: 200ms}}
-  - {main: robot_mains:talk, arguments: [3], name: last, start_after: {ended: 5}, required: true}
-stop: {timeout: 120s}
+  - main: robot_mains:talk
+    arguments: [3]
+    name: last
+    start_after: {ended: 5, topic: /done}
+    required: true
+stop: {timeout: 300s}
 """
     done = record(tmp_path, text, "--processes", "--executor", "multi")
     assert done.returncode == 0, done.stderr
@@ -226,7 +238,7 @@ def test_what_a_program_does_is_known_while_it_runs(
 ) -> None:
     program = f"{{program: {compiled('counter.c')}, arguments: ['100']}}"
     later = "{node: robot:Talker, start_after: {topic: /count}}"
-    done = record(tmp_path, f"nodes: [{program}, {later}]\nstop: {{topic: /same, duration: 60s}}\n")
+    done = record(tmp_path, f"nodes: [{program}, {later}]\nstop: {{topic: /same, timeout: 300s}}\n")
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "run.mcap") as trace:
         assert "/same" in trace.result["stop_reason"]
@@ -293,14 +305,15 @@ def test_a_bag_is_played_in_real_time(tmp_path: Path, command: Any) -> None:
 @pytest.mark.parametrize(
     ("main", "said"),
     [
-        ("crash", "rsltrace: error: robot_mains:crash was killed by SIGSEGV, 0."),
+        ("crash", "rsltrace: error: robot_mains:crash was killed by SIGSEGV, "),
         ("fail", "rsltrace: error: robot_mains:fail raised ValueError: of the main"),
     ],
 )
 def test_a_process_that_fails_is_named_and_the_trace_is_kept(
     main: str, said: str, tmp_path: Path
 ) -> None:
-    text = f"nodes: [{{main: robot_mains:{main}}}, {{node: robot:Talker}}]\nstop: {{timeout: 60s}}"
+    later = "{node: robot:Talker, start_after: {topic: /last_words}}"  # the trace will have them
+    text = f"nodes: [{{main: robot_mains:{main}}}, {later}]\nstop: {{timeout: 300s}}"
     done = record(tmp_path, text)
     assert done.returncode == 3
     assert said in done.stderr
@@ -317,8 +330,10 @@ def test_a_process_that_fails_is_named_and_the_trace_is_kept(
 def test_all_that_a_killed_program_has_done_is_kept(
     tmp_path: Path, command: Any, compiled: Callable[[str], Path]
 ) -> None:
-    program = f"{{program: {compiled('counter.c')}, arguments: ['10', kill], on_exception: log}}"
-    done = record(tmp_path, f"nodes: [{program}, {{node: robot:Talker}}]\nstop: {{duration: 2s}}\n")
+    program = f"program: {compiled('counter.c')}, name: counter, arguments: ['10', kill]"
+    program = f"{{{program}, on_exception: log}}"
+    later = "{node: robot:Talker, start_after: {ended: counter}}"
+    done = record(tmp_path, f"nodes: [{program}, {later}]\nstop: {{topic: /same, timeout: 300s}}\n")
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "run.mcap") as trace:
         trace.check()
@@ -340,28 +355,21 @@ def started(folder: Path, text: str) -> tuple[subprocess.Popen[str], int]:
         stderr=subprocess.PIPE,
         text=True,
     )
-    deadline = time.monotonic() + 120
     told = folder / "pid"
-    while not (told.exists() and told.read_text()):
-        if time.monotonic() > deadline or process.poll() is not None:
-            process.kill()
-            pytest.fail(process.communicate()[1])
-        time.sleep(0.05)
+    try:
+        wait_until(lambda: told.exists() and bool(told.read_text()), process)
+    except BaseException:
+        process.kill()
+        raise
     return process, int(told.read_text())
 
 
 def is_gone(number: int) -> bool:
-    """Wait until a process is there no more."""
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        try:
-            state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.05)
-    return False
+    """Return whether a process is there no more."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
 
 
 DEAF = "nodes: [{main: robot_mains:deaf, arguments: [pid]}, {node: robot:Talker}]\n"
@@ -382,14 +390,15 @@ def test_what_cannot_be_observed_of_a_process_is_named(tmp_path: Path) -> None:
 def test_ctrl_c_ends_all_processes_even_one_that_does_not_listen(tmp_path: Path) -> None:
     process, deaf = started(tmp_path, DEAF)
     try:
+        wait_until(lambda: has_messages(tmp_path / "run.mcap", "/same"), process)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=120)
+        _, said = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
         process.wait()
     assert process.returncode == 130, said
     assert "robot_mains:deaf did not" in said
-    assert is_gone(deaf)
+    wait_until(lambda: is_gone(deaf))
     with Trace.open(tmp_path / "run.mcap") as trace:
         trace.check()
         assert trace.result["stop_reason"] == "interrupted"
@@ -407,18 +416,16 @@ def test_no_process_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
     ]
     assert deaf in children
     assert len(children) == 2
-    deadline = time.monotonic() + 60
-    while not has_events(tmp_path / "run.mcap") and time.monotonic() < deadline:
-        time.sleep(0.1)
+    wait_until(lambda: has_messages(tmp_path / "run.mcap", "/same"), process)
     process.kill()
     process.communicate()
-    assert all(map(is_gone, children))
-    assert has_events(tmp_path / "run.mcap")
+    wait_until(lambda: all(map(is_gone, children)))
+    assert has_messages(tmp_path / "run.mcap", "/same")
 
 
-def has_events(path: Path) -> bool:
+def has_messages(path: Path, topic: str) -> bool:
     with Trace.open(path) as trace:
-        return trace.event_count > 0
+        return any(trace.messages(topic))
 
 
 def test_the_job_is_judged_before_anything_begins(tmp_path: Path) -> None:
@@ -447,7 +454,7 @@ def test_without_a_network_it_says_so(tmp_path: Path) -> None:
         env={**environment(tmp_path), "PATH": os.environ["PATH"]},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == 2
     assert "loopback network is down" in done.stderr

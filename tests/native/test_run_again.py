@@ -16,7 +16,7 @@ from rsltrace.errors import ReplayError
 from rsltrace.search.explore.table import result_rows
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
-from tests.native.running import COMMAND, environment
+from tests.native.running import COMMAND, PATIENCE_S, environment
 
 pytestmark = [
     pytest.mark.ros,
@@ -45,14 +45,17 @@ class Talker(Node):
 
 
 class Mixer(Node):
-    # What it publishes depends on the order of all that it has heard and done.
+    # What it publishes depends on the order of all that it has heard and done. It asks once the
+    # server has heard it: their clients and services, created first, have then been discovered.
     def __init__(self):
         super().__init__("mixer")
-        self.mixed = self.ticks = self.answers = 0
+        self.mixed = self.answers = 0
+        self.asks = False
+        self.client = self.create_client(Trigger, "/ask")
         self.out = self.create_publisher(UInt64, "/mixed", 10)
         self.stamped = self.create_publisher(Header, "/stamped", 10)
         self.create_subscription(UInt64, "/numbers", self.on_number, 1)
-        self.client = self.create_client(Trigger, "/ask")
+        self.create_subscription(UInt64, "/heard", self.on_heard, 10)
         self.create_timer(0.011, self.on_timer)
 
     def mix(self, number):
@@ -65,26 +68,41 @@ class Mixer(Node):
     def on_timer(self):
         self.mix(1)
         self.stamped.publish(Header(stamp=self.get_clock().now().to_msg()))
-        self.ticks += 1
-        if self.ticks > 90 and self.client.service_is_ready():  # it has been discovered
+        if self.asks:
             self.client.call_async(Trigger.Request()).add_done_callback(self.on_answer)
+
+    def on_heard(self, message):
+        self.asks = True
 
     def on_answer(self, future):
         self.answers += len(future.result().message)  # a task, which has no turn
 
 
 class Server(Node):
+    # Publishes /over when it has heard and been asked often enough, however long that takes.
     def __init__(self):
         super().__init__("server")
         self.last = ""
-        self.create_subscription(UInt64, "/mixed", self.on_mixed, 10)
+        self.heard = self.asked = 0
         self.create_service(Trigger, "/ask", self.on_ask)
+        self.over = self.create_publisher(UInt64, "/over", 10)
+        self.heard_one = self.create_publisher(UInt64, "/heard", 10)
+        self.create_subscription(UInt64, "/mixed", self.on_mixed, 10)
+
+    def count(self):
+        if self.heard >= 60 and self.asked >= 20:
+            self.over.publish(UInt64(data=self.heard))
 
     def on_mixed(self, message):
         self.last = str(message.data)
+        self.heard += 1
+        self.heard_one.publish(message)
+        self.count()
 
     def on_ask(self, request, response):
         response.message = self.last
+        self.asked += 1
+        self.count()
         return response
 
 
@@ -103,7 +121,7 @@ nodes:
   - {node: mixing:Talker, arguments: {name: b, first: 2000}}
   - node: mixing:Mixer
   - SERVER
-stop: {duration: 2s}
+stop: {topic: /over, timeout: 240s}
 """
 
 
@@ -113,7 +131,14 @@ def recorded(folder: Path, server: str, *words: str) -> None:
     (folder / "serving.py").write_text("import mixing\nmixing.serve()\n")
     (folder / "job.yaml").write_text(JOB.replace("SERVER", server))
     started = [*COMMAND, "record", "--native", "job.yaml", "-o", "native.mcap", "-q", *words]
-    subprocess.run(started, cwd=folder, env=environment(folder), check=True, timeout=300)
+    subprocess.run(started, cwd=folder, env=environment(folder), check=True, timeout=PATIENCE_S)
+
+
+def middle_of_mixed(path: str) -> int:
+    """Return the event that sent the middle message on /mixed: an edit there has consequences."""
+    with Trace.open(Path(path)) as trace:
+        events = [index for _, index, _ in trace.messages("/mixed")]
+    return events[len(events) // 2]
 
 
 def starts(trace: Trace) -> dict[str, list[int]]:
@@ -168,7 +193,7 @@ def test_a_replay_does_what_the_native_run_did(
     verified = command("replay", "again.mcap", "-q")
     assert verified.returncode == 0, verified.stderr
     assert "verified all" in verified.stdout
-    edit = '40: node("/mixer").mixed = 7'
+    edit = f'{middle_of_mixed("again.mcap")}: node("/mixer").mixed = 7'
     branch = command("replay", "again.mcap", "-q", "--edit", edit)
     assert branch.returncode == 1, branch.stderr
     assert "/mixed" in branch.stdout

@@ -20,7 +20,7 @@ pytestmark = [
 
 JOB = """
 nodes: [{node: states:Managed}, {node: states:ByHand}, {node: states:Manager}]
-stop: {topic: /over, timeout: 60s}
+stop: {topic: /over, timeout: 300s}
 """
 
 

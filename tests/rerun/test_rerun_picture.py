@@ -38,16 +38,24 @@ def colours(png: Path) -> int:
     return len(set(zlib.decompress(packed)))
 
 
+def take(recording: Path, timeline: str, value: float) -> None:
+    """Have the viewer draw a recording; a busy machine takes long to draw anything at all."""
+    png = recording.with_suffix(".png")
+    for settle_s in (1.0, 10.0, 100.0):
+        assert picture.take(recording, png, timeline, value, settle_s=settle_s) == []
+        if colours(png) > 50:
+            return
+    pytest.fail("nothing is drawn")
+
+
 def test_one_run(tmp_path: Path) -> None:
     gallery.write_gallery(tmp_path / "run.mcap", 40)
     export([tmp_path / "run.mcap"], tmp_path / "run.rrd")
-    assert picture.take(tmp_path / "run.rrd", tmp_path / "run.png", "sim_time", 7.5) == []
-    assert colours(tmp_path / "run.png") > 50
+    take(tmp_path / "run.rrd", "sim_time", 7.5)
 
 
 def test_two_runs(tmp_path: Path) -> None:
     gallery.write_gallery(tmp_path / "a.mcap", 40)
     gallery.write_gallery(tmp_path / "b.mcap", 40, differs_from=20)
     export([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "ab.rrd")
-    assert picture.take(tmp_path / "ab.rrd", tmp_path / "ab.png", "row", 60) == []
-    assert colours(tmp_path / "ab.png") > 50
+    take(tmp_path / "ab.rrd", "row", 60)

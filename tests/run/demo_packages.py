@@ -61,7 +61,7 @@ def package_of(program: str) -> str:
 
 
 class Native:
-    """A graph of programs over DDS, apart from everything else on the machine."""
+    """A graph of programs over DDS."""
 
     def __init__(self, prefix: Path, folder: Path) -> None:
         self._folder = folder
@@ -73,8 +73,6 @@ class Native:
             "PYTHONUNBUFFERED": "1",
             "RCUTILS_CONSOLE_OUTPUT_FORMAT": "|{name}|{message}",
             "RCUTILS_COLORIZED_OUTPUT": "0",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
             "ROS_LOG_DIR": str(folder / "log"),
         }
         self._running: dict[str, subprocess.Popen[bytes]] = {}
@@ -106,7 +104,7 @@ class Native:
     def stop(self, program: str) -> None:
         """End a program as Ctrl-C does."""
         self._running[program].send_signal(signal.SIGINT)
-        self.wait(program, 120)
+        self.wait(program, 600)
 
     def output(self, program: str) -> str:
         """Return what a program has printed."""
@@ -120,10 +118,10 @@ def run_natively(prefix: Path, folder: Path) -> dict[str, list[str]]:
         for program in SERVERS:
             native.start(program)
         native.start(*CENSUS)
-        native.wait("census", 240)
+        native.wait("census", 600)
         for program in CLIENTS:
             native.start(program)
-        deadline = time.monotonic() + 240
+        deadline = time.monotonic() + 600
         for program in CLIENTS:
             native.wait(program, max(deadline - time.monotonic(), 1))
         for program in SERVERS:

@@ -18,7 +18,7 @@ from rsltrace.errors import SetupError
 from rsltrace.forking import die_with_parent
 from rsltrace_viewer.rerun_export.sdk import LOOPBACK, require, require_control, viewer
 
-LOADED_S_MAX = 20.0
+LOADED_S_MAX = 120.0
 _UP_S_MAX = 60.0
 _END_S_MAX = 5.0
 _TIME_MAX = 2**63 - 1

@@ -15,7 +15,7 @@ def main(args=None):
     for number in range(5):
         request = BasicTypes.Request(int64_value=total, int32_value=number)
         future = client.call_async(request)
-        rclpy.spin_until_future_complete(node, future, timeout_sec=20.0)
+        rclpy.spin_until_future_complete(node, future, timeout_sec=300.0)
         answer = future.result()
         node.get_logger().info(f"{answer.string_value}={answer.int64_value}")
         total = answer.int64_value

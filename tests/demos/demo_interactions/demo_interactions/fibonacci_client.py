@@ -51,7 +51,7 @@ def main(args=None):
     """Run the program."""
     rclpy.init(args=args)
     node = FibonacciClient()
-    if not node.client.wait_for_server(timeout_sec=20.0):
+    if not node.client.wait_for_server(timeout_sec=300.0):
         raise SystemExit("there is no action server")
     node.attempt(99)
     node.attempt(5)

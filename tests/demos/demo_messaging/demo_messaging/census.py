@@ -39,7 +39,7 @@ def main(args=None):
     words = remove_ros_args(sys.argv if args is None else args)[1:]
     node = Census(words)
     same = 0
-    while same < 4:
+    while same < 8:
         rclpy.spin_once(node, timeout_sec=0.5)
         seen = node.look() if node.present() else None
         same = same + 1 if seen is not None and seen == node.last else 0

@@ -20,7 +20,7 @@ def main(args=None):
         handler.add_parameter_callback("target", "/thermostat", lambda p: events.append(p))
         setpoints = []
         node.create_subscription(Float64, "setpoint", lambda m: setpoints.append(m.data), 10)
-        if not client.wait_for_services(timeout_sec=20.0):
+        if not client.wait_for_services(timeout_sec=300.0):
             raise RuntimeError("there is no thermostat")
         while not (node.count_publishers("/setpoint") and events_arrive(node)):
             rclpy.spin_once(node, timeout_sec=0.05)
