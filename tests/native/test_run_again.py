@@ -250,6 +250,7 @@ class Fuse(Node):
     def __init__(self):
         super().__init__("fuse")
         self.a = 0
+        self.over = self.create_publisher(UInt64, "/over", 10)
         self.create_subscription(UInt64, "/a", self.on_a, 10)
         self.create_subscription(UInt64, "/b", self.on_b, 10)
 
@@ -259,6 +260,8 @@ class Fuse(Node):
     def on_b(self, message):
         if message.data > LIMIT and self.a < message.data:
             raise ValueError("b before a")
+        if message.data >= 60:
+            self.over.publish(message)
 
 
 LIMIT = 1 << 60
@@ -269,7 +272,7 @@ nodes:
   - {node: racing:Sensor, arguments: {name: sensor_a, topic: /a}}
   - {node: racing:Sensor, arguments: {name: sensor_b, topic: /b}}
   - node: racing:Fuse
-stop: {duration: 1s}
+stop: {topic: /over, timeout: 240s}
 """
 
 
@@ -281,11 +284,12 @@ def test_other_orders_from_a_time_on(tmp_path: Path, command: Any) -> None:
     subprocess.run(started, cwd=tmp_path, env=environment(tmp_path), check=True, timeout=300)
     command("replay", "native.mcap", "-q", "-o", "again.mcap")
     with Trace.open(Path("again.mcap")) as trace:
-        half_ns = trace.start_ns + 500_000_000
+        half_ns = [stamp_ns for stamp_ns, _, _ in trace.messages("/tick")][30]
         ticks = sum(stamp_ns <= half_ns for stamp_ns, _, _ in trace.messages("/tick"))
+        since_start = f"{half_ns - trace.start_ns}ns"
     (tmp_path / "racing.py").write_text(RACE.replace("1 << 60", str(ticks + 2)))  # only then
-    words = ("--fork-after", "0.5s", "--strategy", "random", "--budget", "4", "--jobs", "1", "-q")
-    done = command("explore", "native.mcap", *words)
+    words = ("--strategy", "random", "--budget", "4", "--jobs", "1", "-q")
+    done = command("explore", "native.mcap", "--fork-after", since_start, *words)
     assert done.returncode == 1, done.stdout + done.stderr
     assert "exception: /fuse: subscription /b" in done.stdout
     plain, *found = result_rows(Path("native.explore"))
