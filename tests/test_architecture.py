@@ -282,6 +282,7 @@ RUNS_CODE = {
     # Modules of a fixed list of ours, or libraries, by names that stand in the source.
     "rsltrace/__init__.py": "import_module",  # public names, when they are first used
     "rsltrace/cli/main.py": "import_module",  # the module of a command
+    "rsltrace/compiled.py": "import_module",  # our own in C
     "rsltrace/job/__init__.py": "import_module",  # public names of jobs
     "rsltrace/debug/simulation.py": "import_module",  # rclpy, before the first run
     "rsltrace/adapters/rclpy/boundary/installation.py": "exec_module import_module",  # of rosidl
