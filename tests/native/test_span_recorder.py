@@ -197,6 +197,26 @@ def test_equal_messages_of_equal_numbers_are_told_apart_by_their_time() -> None:
     assert causes.of(got(5, 1, 115)) == (NO_EVENT, 0)  # somebody else's
     assert causes.of(got(6, 1, 105)) == (NO_EVENT, 0)
     assert causes.unknown == 2
+    causes.sent(sent(5, 1, 108, 112), event=2, output=0)
+    assert causes.of(got(5, 1, 109)) == (NO_EVENT, 0)  # either's
+    assert causes.of(got(5, 1, 111)) == (2, 0)
+
+
+def test_equal_feedback_comes_in_the_order_in_which_it_was_sent() -> None:
+    causes = CauseIndex()
+    for event in range(2):
+        causes.sent(sent(1, 0, 100, 110), event, output=0)
+    assert [causes.of(got(1, 0, 0)) for _ in range(3)] == [(0, 0), (1, 0), (1, 0)]
+
+
+def test_equal_responses_to_two_clients_have_their_own_cause_or_none() -> None:
+    causes = CauseIndex()
+    causes.sent(sent(5, 1, 100, 110), event=0, output=0)
+    assert causes.of(got(5, 1, 0)) == (0, 0)
+    for event in (1, 2):
+        causes.sent(sent(5, 1, 100, 110), event, output=0)
+    assert [causes.of(got(5, 1, 0)) for _ in range(2)] == [(NO_EVENT, 0)] * 2
+    assert causes.unknown == 2
 
 
 def test_a_single_candidate_is_taken_if_only_clocks_disagree() -> None:
