@@ -104,6 +104,30 @@ def test_an_interrupt_waits_until_what_was_sent_is_noted() -> None:
     assert [one.entity for one in span.outputs if isinstance(one, SentMessage)] == [topic]
 
 
+def test_an_interrupt_waits_until_a_message_is_taken() -> None:
+    class Subscription:
+        def take_message(self, kind: object, raw: bool) -> None: ...
+
+    taken = []
+
+    def take(*_: object) -> tuple[None, bytes]:
+        os.kill(os.getpid(), signal.SIGINT)
+        taken.append(True)
+        return None, b""
+
+    observer = MessageObserver(SpanRecorder(), ObservedEntities(lambda _: None), take)
+    before = signal.signal(signal.SIGINT, observer.interrupt)
+    try:
+        with (
+            observer.watched(MagicMock(Subscription=Subscription)),
+            pytest.raises(KeyboardInterrupt),
+        ):
+            Subscription().take_message(None, False)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert taken == [True]
+
+
 def test_threads_that_share_a_publisher_count_as_the_middleware_does() -> None:
     from std_msgs.msg import String
 
