@@ -86,7 +86,7 @@ class MessageObserver:
         self._taker = taker
         self._local = threading.local()
         self._main_thread = threading.main_thread().ident
-        self._main_is_sending = self._is_interrupted = False
+        self._main_is_busy = self._is_interrupted = False
         self.on_message: dict[str, Callable[[bytes, Any], object]] = {}
         """Called with the messages on a topic, and of their class."""
         self.unreadable = 0
@@ -171,26 +171,33 @@ class MessageObserver:
 
     def interrupt(self, number: int, frame: FrameType | None) -> None:
         """Interrupt the main thread as Python does, but not between a message that leaves and the
-        note of it: whoever gets it finds its cause."""
-        if not self._main_is_sending:
+        note of it: whoever gets it finds its cause; nor within rclpy, which makes it a TypeError.
+        """
+        if not self._main_is_busy:
             raise KeyboardInterrupt
         self._is_interrupted = True
 
     @contextmanager
     def _sending(self) -> Iterator[CallbackSpan]:
         """Have an event under way that sends something within the block, and says so there."""
+        with self._uninterrupted():
+            span = self._recorder.sending()
+            try:
+                yield span
+            except BaseException:
+                self._recorder.sent(span, None)
+                raise
+
+    @contextmanager
+    def _uninterrupted(self) -> Iterator[None]:
         is_main = threading.get_ident() == self._main_thread
         if is_main:
-            self._main_is_sending = True
-        span = self._recorder.sending()
+            self._main_is_busy = True
         try:
-            yield span
-        except BaseException:
-            self._recorder.sent(span, None)
-            raise
+            yield
         finally:
             if is_main:
-                self._main_is_sending = False
+                self._main_is_busy = False
                 if self._is_interrupted:
                     self._is_interrupted = False
                     raise KeyboardInterrupt
@@ -222,7 +229,8 @@ class MessageObserver:
             if self._taker is None:
                 found = original(handle, message_type, raw)
             else:
-                found, gid = self._taker(handle, message_type, raw)
+                with self._uninterrupted():
+                    found, gid = self._taker(handle, message_type, raw)
             begun_ns = now_ns()
             entity = self._entities.find(handle)
             if found is not None and entity is not None:

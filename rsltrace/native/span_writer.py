@@ -9,6 +9,7 @@ from array import array
 from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Protocol
 
@@ -46,6 +47,7 @@ KEPT = 200_000
 SLACK_NS = 1_000_000
 """How far the middleware's clock may be from ours."""
 
+_TAKEN = b"taken"
 _Key = tuple[str, int, int]
 _Place = tuple[int, int, int, int, bytes]
 
@@ -55,6 +57,7 @@ class CauseIndex:
 
     def __init__(self, kept: int = KEPT) -> None:
         self._places: defaultdict[_Key, list[_Place]] = defaultdict(list)
+        self._turns: defaultdict[_Key, dict[int, count[int]]] = defaultdict(dict)
         self._order: deque[_Key] = deque()
         self._kept = kept
         self.unknown = 0
@@ -70,28 +73,44 @@ class CauseIndex:
             self._places[oldest].pop(0)
             if not self._places[oldest]:
                 del self._places[oldest]
+                self._turns.pop(oldest, None)
 
     def of(self, taken: ReceivedInput) -> tuple[int, int]:
         """Return the event and output from which an input came; ``NO_EVENT`` if that is unknown."""
         if not taken.channel:
             return NO_EVENT, 0
-        places = self._places.get((taken.channel, taken.sequence, taken.digest), ())
+        key = taken.channel, taken.sequence, taken.digest
+        places = self._places.get(key, ())
         if taken.gid:
             for event, output, *_, gid in places:
                 if gid == taken.gid:
                     return event, output
             places = [place for place in places if not place[4]]
-        for event, output, before_ns, after_ns, _ in places:
-            if before_ns <= taken.source_ns <= after_ns:
-                return event, output
+        during = [place[:2] for place in places if place[2] <= taken.source_ns <= place[3]]
+        if len(during) == 1:  # which of several clients' equal requests at once, nobody knows
+            return during[0]
         if places and not taken.source_ns:  # of actions, which do not tell when
-            return places[-1][:2]
+            return self._of_action(key, taken)
         if len(places) == 1:
             event, output, before_ns, after_ns, _ = places[0]
             if before_ns - SLACK_NS <= taken.source_ns <= after_ns + SLACK_NS:
                 return event, output
         self.unknown += 1
         return NO_EVENT, 0
+
+    def _of_action(self, key: _Key, taken: ReceivedInput) -> tuple[int, int]:
+        """Feedback comes in its order; a request or response comes once."""
+        places = self._places[key]
+        if not taken.sequence:
+            turn = self._turns[key].setdefault(taken.entity.id, count())
+            return places[min(next(turn), len(places) - 1)][:2]
+        left = [at for at, place in enumerate(places) if place[4] != _TAKEN]
+        if len(left) != 1:
+            self.unknown += 1
+            return NO_EVENT, 0
+        event, output, before_ns, after_ns, _ = places[left[0]]
+        places[left[0]] = event, output, before_ns, after_ns, _TAKEN
+        return event, output
 
 
 _EVERY_S = 0.05

@@ -1,7 +1,7 @@
 // The node of robot_mains:count on rcl: it publishes numbers and a text that all others publish, too,
 // and writes down what it has sent and got, and in a file that it has heard enough of each.
 //
-// Usage: counting [where to write] [first number] [period in ms] [threads: eight publish, too]
+// Usage: counting [where to write] [first number] [period in ms] [threads: eight more publish]
 #include <pthread.h>
 #include <rcl/error_handling.h>
 #include <rcl/rcl.h>
@@ -11,6 +11,7 @@
 #include <std_msgs/msg/u_int64.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <tracetools/tracetools.h>
 
 #define CHECK(call)                                                            \
@@ -90,8 +91,9 @@ int main(int argc, const char **argv) {
   CHECK(rcl_wait_set_init(&set, 2, 0, 1, 0, 0, 0, &context, allocator));
   signal(SIGINT, end);
 
+  const int has_threads = argc > 4 && strcmp(argv[4], "threads") == 0;
   pthread_t threads[8] = {0};
-  for (int i = 0; argc > 4 && i < 8; i++)
+  for (int i = 0; has_threads && i < 8; i++)
     pthread_create(&threads[i], NULL, publish, (void *)(uintptr_t)(1000000 * (i + 1)));
 
   static uint64_t got[1 << 20];
@@ -111,7 +113,7 @@ int main(int argc, const char **argv) {
       note_if_enough(got[count++] = message.data, first);
     if (set.subscriptions[1] != NULL && rcl_take(&in[1], &other, NULL, NULL) == RCL_RET_OK) same++;
   }
-  for (int i = 0; argc > 4 && i < 8; i++) pthread_join(threads[i], NULL);
+  for (int i = 0; has_threads && i < 8; i++) pthread_join(threads[i], NULL);
   FILE *file = fopen(argv[1], "w");
   fprintf(file, "{\"sent\": %lu, \"same\": %lu, \"got\": [", next - first, same);
   for (size_t i = 0; i < count; i++) fprintf(file, i == 0 ? "%lu" : ", %lu", got[i]);

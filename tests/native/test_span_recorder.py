@@ -104,6 +104,30 @@ def test_an_interrupt_waits_until_what_was_sent_is_noted() -> None:
     assert [one.entity for one in span.outputs if isinstance(one, SentMessage)] == [topic]
 
 
+def test_an_interrupt_waits_until_a_message_is_taken() -> None:
+    class Subscription:
+        def take_message(self, kind: object, raw: bool) -> None: ...
+
+    taken = []
+
+    def take(*_: object) -> tuple[None, bytes]:
+        os.kill(os.getpid(), signal.SIGINT)
+        taken.append(True)
+        return None, b""
+
+    observer = MessageObserver(SpanRecorder(), ObservedEntities(lambda _: None), take)
+    before = signal.signal(signal.SIGINT, observer.interrupt)
+    try:
+        with (
+            observer.watched(MagicMock(Subscription=Subscription)),
+            pytest.raises(KeyboardInterrupt),
+        ):
+            Subscription().take_message(None, False)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert taken == [True]
+
+
 def test_threads_that_share_a_publisher_count_as_the_middleware_does() -> None:
     from std_msgs.msg import String
 
@@ -196,6 +220,26 @@ def test_equal_messages_of_equal_numbers_are_told_apart_by_their_time() -> None:
     assert causes.of(got(5, 1, 105)) == (0, 0)
     assert causes.of(got(5, 1, 115)) == (NO_EVENT, 0)  # somebody else's
     assert causes.of(got(6, 1, 105)) == (NO_EVENT, 0)
+    assert causes.unknown == 2
+    causes.sent(sent(5, 1, 108, 112), event=2, output=0)
+    assert causes.of(got(5, 1, 109)) == (NO_EVENT, 0)  # either's
+    assert causes.of(got(5, 1, 111)) == (2, 0)
+
+
+def test_equal_feedback_comes_in_the_order_in_which_it_was_sent() -> None:
+    causes = CauseIndex()
+    for event in range(2):
+        causes.sent(sent(1, 0, 100, 110), event, output=0)
+    assert [causes.of(got(1, 0, 0)) for _ in range(3)] == [(0, 0), (1, 0), (1, 0)]
+
+
+def test_equal_responses_to_two_clients_have_their_own_cause_or_none() -> None:
+    causes = CauseIndex()
+    causes.sent(sent(5, 1, 100, 110), event=0, output=0)
+    assert causes.of(got(5, 1, 0)) == (0, 0)
+    for event in (1, 2):
+        causes.sent(sent(5, 1, 100, 110), event, output=0)
+    assert [causes.of(got(5, 1, 0)) for _ in range(2)] == [(NO_EVENT, 0)] * 2
     assert causes.unknown == 2
 
 
