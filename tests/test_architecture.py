@@ -301,7 +301,6 @@ RUNS_CODE = {
     "rsltrace/adapters/workspace/imports.py": "import_module",  # interfaces that were just made
     "rsltrace/run/plans/executables.py": "exec import_module",  # main: a program, or a function
     "rsltrace/run/plans/scheduling.py": "import_module",  # node: module:Class
-    "rsltrace/compiled.py": "import_module",  # a module of ours that may not be built
     "rsltrace/child_processes.py": "runpy",  # a command of ours, in a process
     # Python launch files are programs; they are read in a process of their own.
     "rsltrace/adapters/launch/api/ros_modules.py": "import_module",  # modules of launch

@@ -67,13 +67,13 @@ def marked() -> list[int]:
 
 
 def gone(pids: list[int]) -> bool:
-    """Say whether processes are gone within a minute."""
+    """Say whether processes are gone within ten minutes."""
     return eventually(lambda: not any(map(is_running, pids)))
 
 
 def eventually(is_so: Callable[[], bool]) -> bool:
-    """Say whether something comes true within a minute."""
-    for _ in range(600):
+    """Say whether something comes true within ten minutes."""
+    for _ in range(6000):
         if is_so():
             return True
         time.sleep(0.1)
@@ -366,9 +366,8 @@ def test_a_client_that_disconnects_in_the_middle(job: Callable[..., Path]) -> No
 
     thread = threading.Thread(target=run)
     thread.start()
-    time.sleep(1)
+    assert eventually(lambda: len(marked()) > 2)
     pids = marked()
-    assert len(pids) > 2, pids
     session._lines._end.shutdown(socket.SHUT_RDWR)
     thread.join()
     assert failed

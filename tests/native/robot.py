@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 from collections import Counter as Counts
 from pathlib import Path
 from typing import Any
@@ -81,6 +82,14 @@ class Listener(Node):
 
     def on_same(self, message: String) -> None:
         HEARD["/same"] += 1
+
+
+class LateListener(Listener):
+    """Takes long to construct."""
+
+    def __init__(self) -> None:
+        time.sleep(8)
+        super().__init__()
 
 
 class Server(Node):

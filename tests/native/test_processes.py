@@ -289,7 +289,7 @@ def test_a_bag_is_played_in_real_time(tmp_path: Path, command: Any) -> None:
     text = "nodes: [{node: robot:Listener}]\nbags: [{path: bag, topics: [/numbers, /same]}]\n"
     simulated = command("record", job(tmp_path, text), "-o", "simulated.mcap")
     assert simulated.returncode == 0, simulated.stderr
-    done = record(tmp_path, text)
+    done = record(tmp_path, text.replace("Listener", "LateListener"))
     assert done.returncode == 0, done.stderr
     simulation = Trace.open(tmp_path / "simulated.mcap")
     with Trace.open(tmp_path / "run.mcap") as trace, simulation as planned:

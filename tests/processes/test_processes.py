@@ -354,7 +354,7 @@ def test_large_messages_arrive_as_they_were_sent(compiled: Compiled, tmp_path: P
 
 def _no_process_of(program: Path) -> None:
     """Fail unless every process of a program ends soon: the kernel needs a moment."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 600
     while _processes_of(program):
         assert time.monotonic() < deadline, "a process was left behind"
         time.sleep(0.02)
@@ -374,7 +374,7 @@ def test_no_process_outlives_a_run_that_is_killed(counter: Path, tmp_path: Path)
     _job(tmp_path, counter, "'100'", "hang")
     command = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "t.mcap"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL) as started:
-        deadline = time.monotonic() + 100
+        deadline = time.monotonic() + 600
         while not _processes_of(counter):
             assert time.monotonic() < deadline
             time.sleep(0.02)

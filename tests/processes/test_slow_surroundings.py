@@ -153,7 +153,7 @@ def test_what_rsltrace_has_open_changes_nothing_nor_that_it_is_not_pinned(
 
 
 def _waits_until_it_is(pid: int, state: str) -> None:
-    deadline = time.monotonic() + 100
+    deadline = time.monotonic() + 600
     while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != state:
         assert time.monotonic() < deadline
         time.sleep(0.02)

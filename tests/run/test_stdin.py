@@ -182,7 +182,7 @@ def native(code: Path, name: str) -> list[str]:
     typed = [f"{line}\r" if name == "lines" else line for line in TYPED[name]]
     if name == "lines":
         typed += ["\x04"] * 5
-    until = time.monotonic() + 60
+    until = time.monotonic() + 600
     while not said and time.monotonic() < until:
         time.sleep(0.05)
     time.sleep(1.0)
@@ -195,7 +195,7 @@ def native(code: Path, name: str) -> list[str]:
         while len(said) == before and time.monotonic() < until and process.poll() is None:
             time.sleep(0.05)
         time.sleep(0.3)
-    process.wait(60)
+    process.wait(600)
     listener.join()
     assert process.stderr is not None
     process.stderr.close()
@@ -265,7 +265,10 @@ def test_without_a_standard_input_of_its_own(recorded: Any, tmp_path: Path) -> N
 @pytest.mark.parametrize("name", list(TYPED))
 def test_programs_read_as_they_do_natively(name: str, recorded: Any, tmp_path: Path) -> None:
     here = [text for _, text in logs(recorded(entry(name)).path)]
-    assert here == native(tmp_path / "nodes_under_test.py", name)
+    for _ in range(3):  # a machine may stand still where a program is about to read
+        if here == (there := native(tmp_path / "nodes_under_test.py", name)):
+            return
+    assert here == there
 
 
 def test_a_main_that_looks_now_and_then_finds_keys_when_they_come(recorded: Any) -> None:

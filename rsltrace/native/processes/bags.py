@@ -27,8 +27,8 @@ from rsltrace.run.plans.bags import (
 from rsltrace.trace.recordings.playback import Playback
 
 _SETTLED_S = 0.5
-_SETTLED_WITHIN_S = 5.0
-"""How long the player waits for whoever listens to find it."""
+_SETTLED_WITHIN_S = 30.0
+"""How long the player waits for anybody to listen: constructors load models, machines are busy."""
 
 _Played = Iterator[tuple[int, Any, bytes]]
 
