@@ -89,7 +89,7 @@ def _native(folder: Path, command: list[str], count: int) -> float:
     around = dict(os.environ)
     around["LD_LIBRARY_PATH"] = os.pathsep.join(map(str, built.ros.libraries))
     if command[0] != sys.executable:
-        around["LD_PRELOAD"] = str(built.python_symbols)
+        around["LD_PRELOAD"] = str(built.path.with_name("librsltrace_python_symbols.so"))
     return _cpu_s([*command, "0", str(count)], folder, around)
 
 

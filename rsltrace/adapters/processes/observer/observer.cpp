@@ -92,8 +92,9 @@ void *real(const char *name) {
 // before the time of a record is read and cleared once it is there: who finds it clear sees all
 // records of before.
 //
-// If only the last records are kept, what makes entities, and a copy of what checks are about, is in a
-// ring of its own behind the other one, which is read all the time; in the other one new records take the place of the oldest.
+// If only the last records are kept, what makes entities, and a copy of what checks are about, is in
+// a ring of its own behind the other one, which is read all the time; in the other one new records
+// take the place of the oldest.
 // `reserved` says before they do; `starts` is where the first record of each part of it begins.
 constexpr std::size_t PARTS = 256;
 
@@ -226,7 +227,7 @@ class Ring {
     if (lost_ > 0 && !is_made) {  // what follows lacks something
       if (put(false, Kind::LOST, thread, 0, &lost_, sizeof lost_, nullptr, 0)) lost_ = 0;
     }
-    if ((lost_ > 0 && !is_made) || 
+    if ((lost_ > 0 && !is_made) ||
         !put(is_made, kind, thread, begun_ns, fields, fields_size, data, data_size)) {
       ++lost_;
       head_->lost.fetch_add(1);
