@@ -52,6 +52,8 @@ def flaky(overrides: tuple[Override, ...], **options: Any) -> int:
         cluster=None,
         form="flaky",
         minimize=True,
+        job_folder=None,
+        trust=False,
         history=None,
         **options,
     )
