@@ -94,9 +94,12 @@ def replace_special_method(
 
 
 def _set_slot(stack: ExitStack, kind: type, name: str, value: int | None) -> None:
-    slot = _slot(kind, name)
-    stack.callback(setattr, slot, "value", slot.value)
-    slot.value = value
+    stack.callback(_write_slot, kind, name, _slot(kind, name).value)  # which keeps the type, too
+    _write_slot(kind, name, value)
+
+
+def _write_slot(kind: type, name: str, value: int | None) -> None:
+    _slot(kind, name).value = value
 
 
 def _subclasses_of(kind: type) -> set[type]:

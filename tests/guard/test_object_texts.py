@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import re
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from rsltrace.guard.install import numbered_texts
 from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
@@ -93,3 +96,15 @@ def test_what_keeps_its_address_is_found(
     with Trace.open(tmp_path / "run.mcap") as trace:
         findings = [one for per_event in trace.findings.values() for one in per_event]
     assert len([one for one in findings if one.source is NondeterminismSource.ADDRESS]) == found
+
+
+def test_classes_that_a_run_outlives_are_kept_until_their_slots_are_as_before() -> None:
+    """Else the end of the run writes into memory that is something else's by then."""
+    passing = type("Passing", (), {})
+    lasting = weakref.ref(passing)
+    with numbered_texts():
+        del passing
+        gc.collect()
+        assert lasting() is not None
+    gc.collect()
+    assert lasting() is None
