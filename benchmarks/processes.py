@@ -168,8 +168,8 @@ def main() -> None:
         print(f"{way:30} {each_us:16.1f} {few[way]:16.2f}{limit}")
     one_by_one_s, together_s = heavy_s["false"], heavy_s["true"]
     print(
-        f"two heavy processes: {one_by_one_s:.2f} s one by one, {together_s:.2f} s at the same time:"
-        f" {one_by_one_s / together_s:.2f} times as fast"
+        f"two heavy processes: {one_by_one_s:.2f} s one by one, {together_s:.2f} s at the same "
+        f"time: {one_by_one_s / together_s:.2f} times as fast"
     )
 
 
