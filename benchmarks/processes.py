@@ -5,6 +5,9 @@
 Each callback is that of a timer and publishes a number. Figures are CPU time of both sides per
 callback, the best of all rounds, in µs; what a run costs before its first callback is taken off,
 and stands beside it per process. Natively a timer without period runs as fast as it can.
+
+Last, the time that passes for two processes that each compute for some milliseconds when a message
+arrives: one by one, and at the same time (``parallel: true``).
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -48,6 +52,31 @@ class Counter(Node):
 
 rclpy.init()
 rclpy.spin(Counter())
+"""
+HEAVY = """
+import sys
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+
+class Heavy(Node):
+    def __init__(self, hears, says):
+        super().__init__(says)
+        self.publisher = self.create_publisher(UInt64, says, 10)
+        self.create_subscription(UInt64, hears, self.on_number, 10)
+
+    def on_number(self, number):
+        self.publisher.publish(UInt64(data=sum(range(300_000))))
+
+rclpy.init()
+rclpy.spin(Heavy(*sys.argv[1:]))
+"""
+HEAVY_JOB = """
+parallel: {parallel}
+nodes:
+  - {{script: counter.py, arguments: ['100', '300']}}
+  - {{script: heavy.py, isolated: true, arguments: [count, a]}}
+  - {{script: heavy.py, isolated: true, arguments: [count, b]}}
 """
 JOB = """
 nodes:
@@ -84,6 +113,16 @@ def _recorded(folder: Path, entry: str, count: int) -> float:
     return _cpu_s(command, folder, dict(os.environ))
 
 
+def _two_heavy_s(folder: Path, parallel: str) -> float:
+    job = folder / "heavy.yaml"
+    job.write_text(HEAVY_JOB.format(parallel=parallel))
+    (folder / "heavy.py").write_text(HEAVY)
+    command = [sys.executable, "-m", "rsltrace", "record", job.name, "-o", "t.mcap", "--force"]
+    began_s = time.perf_counter()
+    _cpu_s(command, folder, dict(os.environ))
+    return time.perf_counter() - began_s
+
+
 def _native(folder: Path, command: list[str], count: int) -> float:
     built = library(lambda text: None)
     around = dict(os.environ)
@@ -118,11 +157,20 @@ def main() -> None:
             for way, run in ways.items():
                 few[way] = min(few[way], run(6))
                 many[way] = min(many[way], run(given.callbacks))
+        heavy_s = {
+            parallel: min(_two_heavy_s(folder, parallel) for _ in range(given.rounds))
+            for parallel in ("false", "true")
+        }
     print(f"{'':30} {'µs per callback':>16} {'start, s of CPU':>16}")
     for way in ways:
         each_us = (many[way] - few[way]) / (given.callbacks - 6) * 1e6
         limit = f"   at most {_MAX_US:.0f}" if way == "C, recorded" else ""
         print(f"{way:30} {each_us:16.1f} {few[way]:16.2f}{limit}")
+    one_by_one_s, together_s = heavy_s["false"], heavy_s["true"]
+    print(
+        f"two heavy processes: {one_by_one_s:.2f} s one by one, {together_s:.2f} s at the same "
+        f"time: {one_by_one_s / together_s:.2f} times as fast"
+    )
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from rsltrace.job.parts.vary import VarySpec
 from rsltrace.job.values.checks import (
     attach,
     check,
+    flag,
     given,
     items,
     named_parts,
@@ -165,6 +166,12 @@ class JobFields(JobPart):
         description="Where threads take turns. Default: where they block.",
         examples=[{"switch": "every_line"}],
     )
+    parallel: Annotated[bool, check(flag)] = Field(
+        default=False,
+        description="Whether processes compute at the same time. For those that share nothing but "
+        "ROS: no files, sockets or devices.",
+        examples=[True],
+    )
     min_time_step_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="min_time_step",
@@ -262,6 +269,7 @@ class JobFields(JobPart):
             delay: DelaysSpec | dict[str, Any] | None = None,
             policy: PolicySpec | dict[str, Any] | str | None = None,
             threads: ThreadsSpec | dict[str, Any] | str | None = None,
+            parallel: bool = False,
             min_time_step: TimeLike = 0,
             min_time_step_ns: int = 0,
             executors: Sequence[ExecutorSpec | dict[str, Any]] | str | None = None,

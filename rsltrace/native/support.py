@@ -121,6 +121,7 @@ _STEERING = (
     "clocks",
     "faults",
     "threads",
+    "parallel",
     "vary",
 )
 """Keys of a job that say how a simulation goes; nobody can tell real time and DDS."""

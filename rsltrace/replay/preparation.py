@@ -169,6 +169,7 @@ _MAY_DIFFER = frozenset(
         "timer_ties",
         "livelock_limit",
         "policy",
+        "parallel",
         "min_time_step_ns",
         "executors",
         "execution",

@@ -270,6 +270,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
             "last": None,
         },
         "delay": None,
+        "parallel": False,
         "policy": None,
         "threads": None,
         "min_time_step_ns": 0,

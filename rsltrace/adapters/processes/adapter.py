@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import field
+from itertools import islice
 from pathlib import Path
 
 from rsltrace.adapters.processes.child import ProcessHandle
+from rsltrace.adapters.processes.endpoints import QueueEndpoint
 from rsltrace.adapters.processes.process import Process
 from rsltrace.errors import RunError
 from rsltrace.fast_dataclass import dataclass
@@ -21,6 +23,8 @@ from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.trace.model.event import NO_EVENT, EventKind
 from rsltrace.trace.model.finding import NondeterminismSource
 
+_LOOKS_AHEAD = 64
+"""How much of the ready queue is looked at for others that may begin."""
 _EVERY_PROCESS_ENDED = "every process has ended"
 
 
@@ -60,7 +64,8 @@ class ProcessAdapter:
     ``follows_clock`` says of a node whether /clock drives its ROS time. ``note_answer`` takes what
     code has drawn or read (source, call, answer, stack, node). ``clock`` is there if nodes have
     clocks of their own: given a node (None: nobody) and whether a ROS clock is looked at, it says
-    what is shown, and whether that stays so throughout the event."""
+    what is shown, and whether that stays so throughout the event. ``parallel``: processes compute
+    at the same time where the loop's order is first come, first served."""
 
     def __init__(self, domain: Domain, interfaces: TypeLookup, *, seed: int, log: Log) -> None:
         self.domain = domain
@@ -73,6 +78,7 @@ class ProcessAdapter:
         self.note_answer: Callable[[NondeterminismSource, str, str, str, str], None]
         self.note_answer = lambda source, call, answer, stack, node: None
         self.on_end: Callable[[str], None] = lambda key: None
+        self.parallel = False
         self._seed = seed
 
     def seed_of(self, key: str) -> int:
@@ -124,6 +130,30 @@ class ProcessAdapter:
     def has_ended(self, process: Process) -> None:
         """Take note that a process has ended, in the event under way."""
         self.on_end(process.key)
+
+    def begin_others(self, running: Process) -> None:
+        """Let other processes begin with what comes next for them, while one computes.
+
+        The next event of a process is the first of its own in the ready queue, whatever others
+        send meanwhile: that comes behind it. What it says is taken when its turn comes, so the
+        trace is the same. ``None`` stands for what is in rsltrace's process.
+        """
+        dispatcher = self.domain.dispatcher
+        if not self.parallel or dispatcher.is_steered:
+            return
+        earlier: set[object] = {running}
+        for thing in islice(dispatcher.loop.ready, _LOOKS_AHEAD):
+            process = getattr(thing, "process", None)
+            if (
+                isinstance(thing, QueueEndpoint)
+                and process not in earlier
+                and thing.may_run()
+                and not thing.process.has_begun
+                and thing.process.wants(thing)
+                and not thing.may_lose_arrivals(earlier)
+            ):
+                thing.begin()
+            earlier.add(process)
 
     @property
     def exit_code(self) -> int:

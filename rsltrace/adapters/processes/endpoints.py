@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import Any, Protocol
 
 from rsltrace.adapters.processes.wire import WakeReason, changed_item, gid_of, packed_item
+from rsltrace.errors import RunError
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
@@ -50,6 +51,7 @@ class HostProcess(Protocol):
 
     name: str
     dispatcher: Dispatcher
+    has_begun: bool
 
     def wants(self, thing: WaitableEntity) -> bool:
         """Return whether one of its threads waits for a thing now."""
@@ -59,6 +61,9 @@ class HostProcess(Protocol):
 
     def go_on_with(self, number: int, ready: WakeReason, item: bytes) -> None:
         """Let the thread that waits for a thing go on, until the process waits again."""
+
+    def begin_with(self, number: int, ready: WakeReason, item: bytes) -> None:
+        """Let that thread go on already; ``go_on_with`` follows."""
 
     def was_no_callback(self) -> None:
         """Say that the event under way is no callback's."""
@@ -76,12 +81,14 @@ class RosoutPublisher(Publisher):
         super().send(data, hash64(log_content(data)))
 
 
-class _QueueEndpoint(Receiver):
+class QueueEndpoint(Receiver):
     """An endpoint with a queue of arrivals. ``number`` is what the process calls it."""
 
     process: HostProcess
     number: int
     event_kind: int
+    _begun: tuple[Any, bytes] | None = None
+    """The arrival with which its process has begun, and how that was packed."""
 
     def dispatch(self) -> None:
         if not self.may_run():
@@ -90,15 +97,36 @@ class _QueueEndpoint(Receiver):
             self.process.hold(self)
             return
         arrival = self.queue.popleft()
+        if self._begun is None:
+            item = self.packed(arrival)
+        else:
+            (begun, item), self._begun = self._begun, None
+            if begun is not arrival:
+                raise RunError(
+                    f"{self.describe()} had begun with a message that was then pushed out of its "
+                    "queue, by a publisher that was made in this instant: run the job without "
+                    "`parallel`"
+                )
         self.dispatcher.execute(
             self,
             self.entity_id,
             self.node,
             self.event_kind,
             self.process.go_on_with,
-            (self.number, WakeReason.ENTITY, self.packed(arrival)),
+            (self.number, WakeReason.ENTITY, item),
             *arrival[self.origin],
         )
+
+    def begin(self) -> None:
+        """Let the process begin with the oldest arrival before its turn to be dispatched."""
+        arrival = self.queue[0]
+        item = self.packed(arrival)
+        self._begun = arrival, item
+        self.process.begin_with(self.number, WakeReason.ENTITY, item)
+
+    def may_lose_arrivals(self, senders: Container[object]) -> bool:
+        """Return whether what some processes send may push an arrival out of the queue."""
+        return False
 
     def take(self) -> bytes | None:
         """Return the oldest arrival for who asks without having waited, None if there is none."""
@@ -126,7 +154,7 @@ def with_source(source: str) -> dict[str, object]:
     return {"source": source} if source else {}
 
 
-class _CallbackEndpoint(_QueueEndpoint):
+class _CallbackEndpoint(QueueEndpoint):
     """An endpoint whose callback has a name, if the process says it."""
 
     callback_name = ""
@@ -165,6 +193,9 @@ class ProcessSubscription(_CallbackEndpoint, Subscription):
 
     def arriving_type(self) -> str:
         return self.type_name
+
+    def may_lose_arrivals(self, senders: Container[object]) -> bool:
+        return self.keep is not None and any(one.node.process in senders for one in self.publishers)
 
     def packed(self, delivery: Delivery) -> bytes:
         self._received += 1
@@ -210,7 +241,7 @@ class ProcessService(_CallbackEndpoint, Service):
             self.respond(data, request_id)
 
 
-class ProcessClient(_QueueEndpoint, Client):
+class ProcessClient(QueueEndpoint, Client):
     """A client of a process."""
 
     event_kind = CLIENT

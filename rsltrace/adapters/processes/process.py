@@ -78,6 +78,9 @@ class ProcessRun(EntityFactory, Protocol):
     def has_ended(self, process: Process) -> None:
         """Take note that a process has ended, in the event under way."""
 
+    def begin_others(self, running: Process) -> None:
+        """Let others begin with what comes next for them while one computes."""
+
 
 class Process:
     """An executable that runs beside rsltrace; in the trace, a main.
@@ -105,6 +108,8 @@ class Process:
         self.entity_id = 0
         self.announced = True
         self.begun_ns = 0
+        self.has_begun = False
+        """Whether it computes before its turn (``ProcessAdapter.begin_others``)."""
         self.child: ProcessHandle
         self.ended: ProcessEnd | None = None
         self.things = ProcessEntities(adapter, self)
@@ -219,10 +224,22 @@ class Process:
         if waking is not None:
             waking.off()
         self._running_thread = thread
+        if self.has_begun:
+            self.has_begun = False
+        else:
+            self._send_go(thread, ready, number, item)
+        self.adapter.begin_others(self)
+        self._converse()
+
+    def begin_with(self, number: int, ready: WakeReason, item: bytes) -> None:
+        """Let the thread that waits for a thing go on already; ``go_on_with`` follows."""
+        self.has_begun = True
+        self._send_go(self._wanted[number], ready, number, item)
+
+    def _send_go(self, thread: int, ready: WakeReason, number: int, item: bytes) -> None:
         now_ns = self.dispatcher.loop.now_ns
         head = GO.pack(GO.size - 8 + len(item), CommandKind.GO, now_ns, thread, ready, number)
         self.child.send(head + item)
-        self._converse()
 
     def _converse(self) -> None:
         """Take what the process says until it waits again, or has ended."""
@@ -357,6 +374,12 @@ class Process:
         waits again."""
         self._is_stopping = True
         self.child.give_up_after(_GRACE_S)
+        if self.has_begun:  # an event that the run does not have any more
+            recorder, self.dispatcher.recorder = self.dispatcher.recorder, None
+            self._converse()
+            self.dispatcher.recorder = recorder
+            if self.ended is not None:
+                return
         self.child.send(RECORD.pack(0, CommandKind.STOP))
         self._converse()
         if self.ended is None:

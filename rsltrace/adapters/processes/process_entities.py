@@ -105,7 +105,7 @@ class GraphChange:
     """Wakes a process that waits for the graph to change; what changes before it waits, counts."""
 
     def __init__(self, process: GraphWaiter) -> None:
-        self._process = process
+        self.process = process
         self._is_due = False
         self._is_queued = False
 
@@ -116,14 +116,14 @@ class GraphChange:
 
     def look(self) -> None:
         """Wake the process if it waits for a change that there was."""
-        if self._is_due and not self._is_queued and self._process.waits_for_graph:
+        if self._is_due and not self._is_queued and self.process.waits_for_graph:
             self._is_queued = True
-            self._process.dispatcher.loop.ready.append(self)
+            self.process.dispatcher.loop.ready.append(self)
 
     def dispatch(self) -> None:
         """Let the process go on, as an event, if it still waits."""
         self._is_queued = False
-        process = self._process
+        process = self.process
         if not process.waits_for_graph:
             return
         self._is_due = False
@@ -133,11 +133,11 @@ class GraphChange:
 
     def runnable(self) -> Runnable:
         """Describe it to a policy."""
-        return Runnable("resume", "", self._process.entity_id)
+        return Runnable("resume", "", self.process.entity_id)
 
     def describe(self) -> str:
         """Name it for people."""
-        return f"{self._process.name}: a change of the graph"
+        return f"{self.process.name}: a change of the graph"
 
 
 # QoS events of processes: news of an endpoint's status, handed over when it is waited for.

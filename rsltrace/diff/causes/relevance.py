@@ -110,7 +110,9 @@ def _code(trace: Trace, name: str) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-_NEVER = frozenset(("record", "checks", "metrics", "vary", "livelock_limit", "stop", "vars"))
+_NEVER = frozenset(
+    ("record", "checks", "metrics", "vary", "livelock_limit", "stop", "parallel", "vars")
+)
 _WHEN = frozenset(
     ("timer_ties", "policy", "faults", "execution", "delay", "min_time_step", "executors", "bags")
 )

@@ -35,6 +35,7 @@ from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.executables import compiled_file, process_command
 from rsltrace.run.plans.network import clock_rules
 from rsltrace.simulation.chance.stream import ClockModel
+from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.trace.model.regular_file import not_regular
 from rsltrace.trace.model.texts import printable
@@ -226,6 +227,7 @@ def make_process_adapter(job: Job, world: World) -> ProcessAdapter:
     """Return the adapter through which a job's processes take part in its world."""
     interfaces = TypeLookup(_message_type, _service_type)
     adapter = ProcessAdapter(world.domain, interfaces, seed=job.seed, log=world.show_log)
+    adapter.parallel = job.parallel and type(world.domain.loop) is EventLoop
     programs = world.runtime.programs
     restarts: Counter[str] = Counter()
 

@@ -20,7 +20,12 @@ from rsltrace.simulation.middleware.events.event import (
     OutsideEvent,
     RunOutcome,
 )
-from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, overrides
+from rsltrace.simulation.middleware.events.observer import (
+    EventCall,
+    EventObserver,
+    ObserverOrder,
+    overrides,
+)
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
@@ -131,6 +136,11 @@ class Dispatcher:
         self.node_observers = self._with("node_entered")
         self.entities.observers = self._with("entity_created")
         self.record(self.recorder)
+
+    @property
+    def is_steered(self) -> bool:
+        """Whether somebody may change events, or keep them from running: edits, a debugger."""
+        return any(one.order >= ObserverOrder.EDITS for one in self._observers)
 
     def _with(self, hook: str) -> tuple[EventObserver, ...]:
         return tuple(one for one in self._observers if overrides(one, hook))
