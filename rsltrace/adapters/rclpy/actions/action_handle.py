@@ -8,11 +8,12 @@ one, in the order of arrival.
 from __future__ import annotations
 
 from functools import partialmethod
+from struct import Struct
 from typing import Any, TypeVar
 
 from rsltrace.adapters.rclpy.concurrency.code_lines import FunctionRecorder
 from rsltrace.adapters.rclpy.concurrency.mailbox import servers_text
-from rsltrace.adapters.rclpy.concurrency.tasks import executor_of, start_coroutine
+from rsltrace.adapters.rclpy.concurrency.tasks import executor_of, set_executor, start_coroutine
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
 from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
@@ -34,6 +35,10 @@ _TRANSITIONS = {
     (CANCELING, "CANCELED"): CANCELED,
 }
 
+_STATUS = Struct("<16s3xiIB")
+"""Canonical CDR of action_msgs/msg/GoalStatus where padding precedes the stamp: anywhere in a
+GoalStatusArray but at its begin."""
+
 
 class GoalHandle(Handle):
     """Stands in for ``_rclpy.ActionGoalHandle``: the state machine of one accepted goal."""
@@ -48,8 +53,8 @@ class GoalHandle(Handle):
         self.status = ACCEPTED
         self.accepted_ns = info.stamp.sec * 1_000_000_000 + info.stamp.nanosec
         self.done_ns: int | None = None
-        self.status_bytes = b""
-        """Its part of a status message, without the status; empty before the first message."""
+        self.status_cdr = _STATUS.pack(goal_id, info.stamp.sec, info.stamp.nanosec, ACCEPTED)
+        """Its part of a status message, which lists every known goal."""
         goals[goal_id] = self
 
     def get_status(self) -> int:
@@ -71,6 +76,7 @@ class GoalHandle(Handle):
                 f"with event {event.name}"
             )
         self.status = state
+        self.status_cdr = self.status_cdr[:-1] + state.to_bytes(1, "little")
 
 
 ACTION = int(EventKind.ACTION)
@@ -214,8 +220,7 @@ class ActionHandle(Handle):
             self._ready = None
         if "feedback" in data:
             self._tell_feedback_callback(part, data["feedback"])
-        for future in waitable._futures:
-            future._set_executor(executor_of(self.runtime, part))
+        set_executor(waitable, executor_of(self.runtime, part))
         await waitable.execute(data)
 
     def _tell_feedback_callback(self, part: ActionEndpoint, message: Any) -> None:

@@ -17,7 +17,7 @@ from rsltrace.adapters.rclpy.actions.action_handle import (
 from rsltrace.adapters.rclpy.concurrency.tasks import start_coroutine
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
-from rsltrace.adapters.rclpy.messages.codec import codec_for
+from rsltrace.adapters.rclpy.messages.message_spec import HEADER
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.simulation.middleware.services import RequestId
 from rsltrace.trace.model.event import NO_EVENT
@@ -25,10 +25,7 @@ from rsltrace.trace.model.event import NO_EVENT
 # Return codes of action_msgs/srv/CancelGoal.
 _ERROR_NONE, _ERROR_UNKNOWN_GOAL_ID, _ERROR_GOAL_TERMINATED = 0, 2, 3
 
-# In the CDR of action_msgs/msg/GoalStatusArray the number of goals comes after the header; each of
-# them is an id (octets), a stamp and a status (an octet). The stamp is at a multiple of 4, so there
-# is padding before it in all but the first.
-_NUMBER_AT = 4
+# The first goal in the CDR of action_msgs/msg/GoalStatusArray has no padding between id and stamp.
 _ID, _STAMP_AT = 16, 19
 
 
@@ -66,8 +63,6 @@ class ActionServerHandle(ActionHandle):
         self._status = PublisherHandle(
             node, impl.GoalStatusMessage, self.path("status"), status_qos
         )
-        self._status_type = impl.GoalStatusMessage
-        self._no_goals: bytes = codec_for(self._status_type).serialize(self._status_type())
         self.publishers = [self._feedback, self._status]
         self._expiry = _Expiry(self)
 
@@ -103,26 +98,12 @@ class ActionServerHandle(ActionHandle):
         self._feedback.publish(message)
 
     def publish_status(self) -> None:
-        """Publish the status of every known goal.
-
-        Each message holds all goals, so the bytes of a goal that never change are cached.
-        """
-        parts = [
-            (goal.status_bytes or self._keep_bytes(goal)) + goal.status.to_bytes(1, "little")
-            for goal in self.goals.values()
-        ]
+        """Publish the status of every known goal."""
+        parts = [goal.status_cdr for goal in self.goals.values()]
         number = len(parts).to_bytes(4, "little")
         if parts:
             parts[0] = parts[0][:_ID] + parts[0][_STAMP_AT:]
-        self._status.send(b"".join((self._no_goals[:_NUMBER_AT], number, *parts)))
-
-    def _keep_bytes(self, goal: GoalHandle) -> bytes:
-        from action_msgs.msg import GoalStatus
-
-        alone = self._status_type(status_list=[GoalStatus(goal_info=goal.info)])
-        data = codec_for(self._status_type).serialize(alone)[len(self._no_goals) : -1]
-        goal.status_bytes = data[:_ID] + bytes(_STAMP_AT - _ID) + data[_ID:]
-        return goal.status_bytes
+        self._status.send(b"".join((HEADER, number, *parts)))
 
     # -- goals -----------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from functools import wraps
+from functools import lru_cache, wraps
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec
 from operator import attrgetter
@@ -94,7 +94,7 @@ def _log_callers_quick(logger: Any, real: Any) -> Any:
 
 
 # rclpy's action server formats a goal's id (sixteen octets) five times per goal, for debug records.
-# numpy takes 50 µs for each; the same text is made here in 3.
+# numpy takes 50 µs for each; the same text is made here in 5, and then kept.
 
 _OCTETS = 16
 _OCTET = np.dtype(np.uint8)
@@ -108,34 +108,35 @@ _OLD_STYLE = 113
 def quick_id_texts() -> Iterator[None]:
     """Format arrays of sixteen octets quickly within the ``with`` block."""
     arrayprint: Any = sys.modules.get("numpy._core.arrayprint")
-    real = getattr(arrayprint, "_array2string", None)
-    if real is None:  # another numpy, which has it elsewhere
-        yield
+    keywords = getattr(getattr(arrayprint, "_default_array_str", None), "keywords", {})
+    if "array2string" not in keywords or not hasattr(arrayprint, "format_options"):
+        yield  # another numpy, which has it elsewhere
         return
+    real, current_options = keywords["array2string"], arrayprint.format_options.get
 
-    def _array2string(a: Any, options: Any, separator: str = " ", prefix: str = "") -> Any:
-        if (
-            type(a) is np.ndarray
-            and a.dtype is _OCTET
-            and a.shape == (_OCTETS,)
-            and separator == " "
-            and not prefix
-            and options["formatter"] is None
-            and options["linewidth"] >= _LINE_MIN
-            and options["threshold"] >= _OCTETS
-            and options["legacy"] > _OLD_STYLE
-        ):
-            return octets_text(a)
-        return real(a, options, separator, prefix)
+    def array2string(a: Any, *arguments: Any) -> Any:
+        if type(a) is np.ndarray and a.dtype is _OCTET and a.shape == (_OCTETS,):
+            options = current_options()
+            if (
+                options["formatter"] is None
+                and options["linewidth"] >= _LINE_MIN
+                and options["threshold"] >= _OCTETS
+                and options["legacy"] > _OLD_STYLE
+            ):
+                return octets_text(a.tobytes())
+        return real(a, *arguments)
 
-    with ExitStack() as stack:
-        replace_attribute(stack, arrayprint, "_array2string", _array2string)
+    keywords["array2string"] = array2string  # what ``str`` calls, with the options of now
+    try:
         yield
+    finally:
+        keywords["array2string"] = real
 
 
-def octets_text(octets: Any) -> str:
+@lru_cache(maxsize=16)
+def octets_text(octets: bytes) -> str:
     """Return the text that ``str`` gives for an array of octets that fits into a line."""
-    words = [str(octet) for octet in octets.tolist()]
+    words = [str(octet) for octet in octets]
     width = max(map(len, words))
     return f"[{' '.join([word.rjust(width) for word in words])}]"
 

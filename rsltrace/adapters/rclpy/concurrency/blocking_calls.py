@@ -353,7 +353,9 @@ def _goal_ids(event: CurrentEvent, seed: int) -> Callable[[], uuid.UUID]:
 
     def uuid4() -> uuid.UUID:
         name = event.node.fully_qualified_name if event.node is not None else ""
-        stream = streams.setdefault(name, random.Random(f"goal ids {seed} {name}"))
+        stream = streams.get(name)
+        if stream is None:
+            stream = streams[name] = random.Random(f"goal ids {seed} {name}")
         return uuid.UUID(int=stream.getrandbits(128), version=4)
 
     return uuid4

@@ -6,27 +6,21 @@ import inspect
 from collections.abc import Callable
 from types import FunctionType, MethodType
 from typing import Any
-from weakref import WeakKeyDictionary
 
-from rsltrace.adapters.rclpy.concurrency.coroutines import TaskRun
+from rsltrace.adapters.rclpy.concurrency.coroutines import CoroutineTask, TaskRun
 from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.trace.model.event import EventKind, OutputKind
 
 _TASK = int(EventKind.TASK)
 
-_is_coroutine: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
-
 
 def is_coroutine_function(callback: object) -> bool:
-    """Return whether calling ``callback`` gives a coroutine; cached, as ``inspect`` is slow."""
+    """Return whether calling ``callback`` gives a coroutine, as ``inspect`` does, which is slow."""
     function = callback.__func__ if type(callback) is MethodType else callback
-    if type(function) is not FunctionType:
+    if type(function) is not FunctionType or function.__dict__:  # maybe marked as one
         return inspect.iscoroutinefunction(callback)
-    known = _is_coroutine.get(function)
-    if known is None:
-        known = _is_coroutine[function] = inspect.iscoroutinefunction(callback)
-    return known
+    return bool(function.__code__.co_flags & inspect.CO_COROUTINE)
 
 
 def is_awaited(runtime: Runtime, callback: object) -> bool:
@@ -41,6 +35,14 @@ def executor_of(runtime: Runtime, handle: Any) -> Any:
     if mailbox is not None and mailbox.driver is not None:
         return mailbox.driver.executor
     return runtime.executor
+
+
+def set_executor(waitable: Any, executor: Any) -> None:
+    """Give a waitable's futures the executor of their done callbacks, as rclpy's executors do. An
+    action server has a future for each goal that it remembers."""
+    for future in waitable._futures:
+        if future._executor() is not executor:
+            future._set_executor(executor)
 
 
 def run_callback(
@@ -84,14 +86,18 @@ def start_coroutine(
     input_hash: int,
 ) -> None:
     """Run an entity's ``async def`` callback until it first suspends, as one event."""
-    from rclpy.task import Task
-
     wrapper = handle.wrapper
     group = wrapper.callback_group
     runtime.groups.begin_coroutine(group, wrapper)
+    if is_coroutine_function(callback):
+        task: Any = CoroutineTask(callback(*args))
+    else:  # in place of await_or_execute
+        from rclpy.task import Task
+
+        task = Task(callback, args, executor=executor_of(runtime, handle))
     run = TaskRun(
         runtime.coroutines,
-        Task(callback, args, None, executor=executor_of(runtime, handle)),
+        task,
         called=(callback, args),
         entity=handle.entity_id,
         node=handle.node,

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any
 
 from rsltrace.adapters.rclpy.concurrency.blocking_calls import SimEvent
-from rsltrace.adapters.rclpy.concurrency.tasks import executor_of, start_coroutine
+from rsltrace.adapters.rclpy.concurrency.tasks import executor_of, set_executor, start_coroutine
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
 from rsltrace.adapters.rclpy.handles.entity_handle import EVENTS, Alarm
@@ -268,8 +268,7 @@ class UserWaitable:
         waitable = self.wrapper
         if waitable.is_ready(self._set):
             data = waitable.take_data()
-            for future in waitable._futures:
-                future._set_executor(executor_of(self.runtime, self))
+            set_executor(waitable, executor_of(self.runtime, self))
             await waitable.execute(data)
         if not self._closed:
             self._look_again()

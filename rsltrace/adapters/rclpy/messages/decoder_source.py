@@ -93,7 +93,7 @@ class _Reader:
                 "unpack_wide": unpack_wide,
                 "large": _large_array,
                 "array": array.array,
-                "empty": np.ndarray,  # the guard looks at calls of ``np.empty``
+                "zeros": np.zeros,  # the guard redirects ``np.empty`` and ``np.ndarray``
                 "OCTETS": _OCTETS,
             }
         )
@@ -169,7 +169,7 @@ class _Reader:
         self.run.append(FixedValue(f"{size}s", size, item.size))
         dtype = self.source.constant(item.dtype)
         # Twice as fast as frombuffer and copy, for the usual short arrays.
-        lines = (f"{value} = empty({length}, {dtype})", f"{fill}({value}, 0, {data})")
+        lines = (f"{value} = zeros({length}, {dtype})", f"{fill}({value}, 0, {data})")
         self.values.append(_Value(data, lines))
         return value
 
