@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rsltrace.errors import OutputError
-from rsltrace.trace.mcap.checksum import crc32, joined_crc
+from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.descriptor import PrivateDescriptor
 from rsltrace.trace.mcap.records import MAGIC
 
@@ -97,7 +97,8 @@ class Sink:
     def write(self, *parts: bytes, crc: int | None = None) -> None:
         """Append ``parts`` without joining them: they may be large.
 
-        ``crc`` is their CRC-32, if known. Raises OSError; ``offset`` then counts the written bytes.
+        ``crc`` is the file's CRC-32 with them, if known. Raises OSError; ``offset`` then counts the
+        written bytes.
 
         :raises OutputError: if the file was changed.
         """
@@ -107,7 +108,7 @@ class Sink:
             for part in parts:
                 self.crc = crc32(part, self.crc)
         else:
-            self.crc = joined_crc(self.crc, crc, sum(map(len, parts)))
+            self.crc = crc
         rest = [memoryview(part) for part in parts if part]
         while rest:
             # A full disk first writes a part, and fails at the next call.
