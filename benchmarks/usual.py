@@ -119,10 +119,12 @@ def simulated(
 ) -> Figures:
     """Run a graph under rsltrace: ``count`` is what its job is asked for, ``units`` how many units
     that makes (0: count events)."""
-    runs = [
-        run_rsltrace(graph, max(1, int(count * scale)), folder, record=record, delayed=delayed)
-        for _ in range(2)
-    ]
+    runs = []
+    for _ in range(2):
+        # Its memory serves the next file: a hypervisor may have to find other memory first.
+        (folder / "run.mcap").unlink(missing_ok=True)
+        asked = max(1, int(count * scale))
+        runs.append(run_rsltrace(graph, asked, folder, record=record, delayed=delayed))
     per = int(units * scale) if units else runs[0]["callbacks"]
     return {"units": per, "cpu_s": min(run["cpu_s"] for run in runs)}
 
@@ -267,16 +269,18 @@ def bare_images(scale: float, folder: Path) -> Figures:
 
     data = usual_nodes.image().data
     count = max(5, int(IMAGES * scale))
-    with (folder / "images").open("wb", buffering=0) as file:
-        start = process_time()
-        for _ in range(count):
-            wire = data.tobytes()
-            xxh3_64_intdigest(wire)
-            file.write(wire)
-            for _ in range(2):
-                data[:]
-        cpu_s = process_time() - start
-    return {"units": count, "cpu_s": cpu_s}
+    times = []
+    for _ in range(2):
+        with (folder / "images").open("wb", buffering=0) as file:
+            start = process_time()
+            for _ in range(count):
+                wire = data.tobytes()
+                xxh3_64_intdigest(wire)
+                file.write(wire)
+                for _ in range(2):
+                    data[:]
+            times.append(process_time() - start)
+    return {"units": count, "cpu_s": min(times)}
 
 
 def file_bytes(graph: Graph, scale: float, folder: Path) -> Figures:

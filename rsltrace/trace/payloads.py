@@ -88,6 +88,7 @@ class PayloadReader:
                     yield channel_id, log_time, sequence, records[start:end]
             except DamageError as error:
                 raise damage_error(self._source, entry.span.offset, "the chunk", error) from error
+            del records  # else it would stay while the next, perhaps as large, is read
 
     def check(self) -> None:
         """Raise TraceError unless each chunk has the messages of its indexes and nothing between:

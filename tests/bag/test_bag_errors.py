@@ -262,6 +262,7 @@ def test_a_wrong_crc_is_noticed_on_reaching_its_chunk(mcap_bytes: Any) -> None:
         ({"times": (5, 15)}, "messages lie outside the times the index promises"),
         ({"times": (15, 30)}, "messages lie outside the times the index promises"),
         ({"compression": "brotli"}, "the compression 'brotli' is unknown (not zstd or lz4)"),
+        ({"compression": "x" * 600}, "the compression 'xxx"),
         ({"compression": "zstd"}, "the chunk cannot be decompressed"),
         ({"compression": "lz4"}, "the chunk cannot be decompressed"),
         ({"size": 3}, "the chunk holds 65 bytes where 3 are promised"),

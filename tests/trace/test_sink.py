@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -310,3 +311,35 @@ def test_a_folder_of_somebody_else(there: str) -> None:
         place = unfinished_path(path) if there else path
         assert f"cannot write the trace {place}: Permission denied; choose another" in done.stdout
         assert path.exists() == bool(there)
+
+
+@pytest.mark.parametrize("refused", ["", "the flag", "everything"])
+def test_large_writes_far_into_a_file_stay_out_of_the_cache_where_that_is_possible(
+    path: Path, monkeypatch: pytest.MonkeyPatch, refused: str
+) -> None:
+    flags: list[int] = []
+    pwritev = os.pwritev
+
+    def write(fd: int, parts: Sequence[memoryview], offset: int, flag: int = 0) -> int:
+        flags.append(flag)
+        if (flag and refused) or (refused == "everything" and offset >= 28):
+            raise OSError(errno.ENOSPC, "full")
+        return pwritev(fd, parts, offset)  # the kernel may not know the flag
+
+    monkeypatch.setattr("rsltrace.trace.mcap.sink._CACHED_BYTES", 20)
+    monkeypatch.setattr("rsltrace.trace.mcap.sink._UNCACHED_BYTES_MIN", 10)
+    monkeypatch.setattr(os, "pwritev", write)
+    sink = begun(path)
+    for data in (b"0123456789", b"small"):
+        sink.write(data)
+    if refused == "everything":
+        with pytest.raises(OSError, match="full"):
+            sink.write(b"9876543210")
+        assert sink.offset == 28
+        sink.close()
+        return
+    for data in (b"9876543210", b"0123456789"):
+        sink.write(data[:5], data[5:])
+    sink.finish()
+    assert path.read_bytes() == MAGIC + b"first0123456789small98765432100123456789"
+    assert flags == [0, 0, 0, 0, *([0x80, 0, 0] if refused else [0x80, 0x80])]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 
 try:
     from zlib_ng.zlib_ng import crc32  # carry-less multiplication: ten times as fast as zlib's
@@ -10,23 +10,16 @@ except ImportError:  # a sourced ROS 2 with its own Python may not have it
     from zlib import crc32
 
 _POLYNOMIAL = 0xEDB88320
-
-_Matrix = tuple[int, ...]
-"""The effect of appended zeros on a CRC: linear over GF(2), a column per bit."""
+_ONE = 1 << 31
+"""CRCs are polynomials over GF(2) whose highest bit is the constant term."""
 
 
 def joined_crc(first: int, second: int, length: int) -> int:
     """Return the CRC-32 of two pieces in sequence; the second has ``length`` bytes.
 
-    Takes some 20 microseconds per set bit of the length.
+    Takes some 5 microseconds, and as much for each set bit of a new length.
     """
-    power = 0
-    while length:
-        if length & 1:
-            first = _times(_zeros(power), first)
-        length >>= 1
-        power += 1
-    return first ^ second
+    return _product(first, _zeros(length)) ^ second
 
 
 def crc_of(parts: tuple[bytes, ...]) -> int:
@@ -37,28 +30,32 @@ def crc_of(parts: tuple[bytes, ...]) -> int:
     return crc
 
 
+@lru_cache(maxsize=64)
+def _zeros(length: int) -> int:
+    """Return the factor of a CRC to which ``length`` zero bytes are appended."""
+    factor, power = _ONE, 0
+    while length >> power:
+        if length >> power & 1:
+            factor = _product(factor, _power(power))
+        power += 1
+    return factor
+
+
 @cache
-def _zeros(power: int) -> _Matrix:
-    """Return the effect of 2 ** power zero bytes."""
+def _power(power: int) -> int:
+    """Return the factor of 2 ** power zero bytes."""
     if power == 0:
-        bit = (_POLYNOMIAL, *(1 << n for n in range(31)))
-        two = _squared(bit)
-        return _squared(_squared(two))
-    return _squared(_zeros(power - 1))
+        return _ONE >> 8
+    return _product(_power(power - 1), _power(power - 1))
 
 
-def _squared(matrix: _Matrix) -> _Matrix:
-    return tuple(_times(matrix, column) for column in matrix)
-
-
-def _times(matrix: _Matrix, vector: int) -> int:
+def _product(first: int, second: int) -> int:
     result = 0
-    for column in matrix:
-        if not vector:
-            break
-        if vector & 1:
-            result ^= column
-        vector >>= 1
+    while first:
+        if first & _ONE:
+            result ^= second
+        first = first << 1 & 0xFFFFFFFF
+        second = second >> 1 ^ (_POLYNOMIAL if second & 1 else 0)
     return result
 
 

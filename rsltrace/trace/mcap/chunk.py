@@ -26,6 +26,9 @@ PUBLISH_TIME_BYTES = 8
 _CHUNK_HEAD = struct.Struct("<BQQQQII")
 """Opcode, length, first and last log time, size and CRC unpacked, length of the compression."""
 
+_HEAD_BYTES_MAX = 512
+"""What is read of a chunk for its fields before the data: longer ones name no known compression."""
+
 _U64 = struct.Struct("<Q")
 _HEAD_BYTES = RECORD_HEAD.size
 _MESSAGE_BYTES_MIN = MESSAGE_HEAD.size
@@ -51,19 +54,24 @@ def read_chunk(
     """
     if span.length < _CHUNK_HEAD.size:
         raise DamageError(f"its length is given as {span.length}")
-    record = source.read_at(*span)
+    # Of a file, the data is read apart: it need not be copied out of its record.
+    first = span.length if source.is_remote else min(span.length, _HEAD_BYTES_MAX)
+    record = source.read_at(span.offset, first)
     opcode, length, _, _, size, crc, text = _CHUNK_HEAD.unpack_from(record)
     if opcode != Opcode.CHUNK or length + _HEAD_BYTES != span.length:
         raise DamageError("there is no chunk where the index says")
     data_at = _CHUNK_HEAD.size + text + _U64.size
     data_end = data_at
-    if data_at <= span.length:
+    if data_at <= len(record):
         data_end += _U64.unpack_from(record, data_at - _U64.size)[0]
     if data_end > span.length or (strict and data_end != span.length):
         raise DamageError("the chunk's bytes do not end where its record does")
     if size > size_max:
         raise DamageError(f"a chunk of {size} bytes, where at most {size_max} can be")
-    data = memoryview(record)[data_at:data_end]
+    if data_end <= len(record):
+        data = record[data_at:data_end]
+    else:
+        data = source.read_at(span.offset + data_at, data_end - data_at)
     records = _unpacked(data, record[_CHUNK_HEAD.size : data_at - _U64.size], size)
     if len(records) != size:
         raise DamageError(f"the chunk holds {len(records)} bytes where {size} are promised")
@@ -72,9 +80,9 @@ def read_chunk(
     return records
 
 
-def _unpacked(data: memoryview, compression: bytes, size: int) -> bytes:
+def _unpacked(data: bytes, compression: bytes, size: int) -> bytes:
     if compression == b"":
-        return bytes(data)
+        return data
     if compression == b"zstd":
         return _unzstd(data, size)
     if compression == b"lz4":
@@ -83,7 +91,7 @@ def _unpacked(data: memoryview, compression: bytes, size: int) -> bytes:
     raise DamageError(f"the compression {name!r} is unknown (not zstd or lz4)")
 
 
-def _unzstd(data: memoryview, size: int) -> bytes:
+def _unzstd(data: bytes, size: int) -> bytes:
     import zstandard
 
     try:
@@ -98,7 +106,7 @@ def _unzstd(data: memoryview, size: int) -> bytes:
         raise DamageError(f"the chunk cannot be decompressed ({error})") from None
 
 
-def _unlz4(data: memoryview, size: int) -> bytes:
+def _unlz4(data: bytes, size: int) -> bytes:
     import lz4.frame  # type: ignore[import-untyped]
 
     try:

@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rsltrace.errors import OutputError
-from rsltrace.trace.mcap.checksum import crc32, joined_crc
+from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.descriptor import PrivateDescriptor
 from rsltrace.trace.mcap.records import MAGIC
 
@@ -31,6 +31,11 @@ _READ_BACK_BYTES = 32 << 20
 _PIECE_BYTES = 1 << 20
 _PARTS_MAX = 512
 """The number of parts in one call; Linux allows 1024."""
+_CACHED_BYTES = 1 << 30
+"""Beyond these, large writes do not stay in the kernel's cache (Linux 6.14): it would take all the
+memory that is free, at ten times the cost of the write where a hypervisor has yet to back it."""
+_UNCACHED_BYTES_MIN = 256 << 10
+_RWF_DONTCACHE = 0x80
 
 
 def unfinished_path(path: Path) -> Path:
@@ -57,6 +62,7 @@ class Sink:
         self._process = os.getpid()
         self._written_ns = -1
         self._touched = False
+        self._uncached = sys.platform == "linux"
         replaced = self._replaced = _replaceable_status(path) if force else None
         flags = _OPEN | os.O_CREAT
         if replaced is None:
@@ -97,7 +103,8 @@ class Sink:
     def write(self, *parts: bytes, crc: int | None = None) -> None:
         """Append ``parts`` without joining them: they may be large.
 
-        ``crc`` is their CRC-32, if known. Raises OSError; ``offset`` then counts the written bytes.
+        ``crc`` is the file's CRC-32 with them, if known. Raises OSError; ``offset`` then counts the
+        written bytes.
 
         :raises OutputError: if the file was changed.
         """
@@ -107,17 +114,26 @@ class Sink:
             for part in parts:
                 self.crc = crc32(part, self.crc)
         else:
-            self.crc = joined_crc(self.crc, crc, sum(map(len, parts)))
+            self.crc = crc
         rest = [memoryview(part) for part in parts if part]
         while rest:
             # A full disk first writes a part, and fails at the next call.
-            count = os.pwritev(number, rest[:_PARTS_MAX], self.offset)
+            count = self._write_some(number, rest[:_PARTS_MAX])
             self.offset += count
             while rest and count >= len(rest[0]):
                 count -= len(rest.pop(0))
             if rest:
                 rest[0] = rest[0][count:]
         self._written_ns = os.fstat(number).st_mtime_ns
+
+    def _write_some(self, number: int, parts: list[memoryview]) -> int:
+        large = self.offset >= _CACHED_BYTES and sum(map(len, parts)) >= _UNCACHED_BYTES_MIN
+        if large and self._uncached:
+            try:
+                return os.pwritev(number, parts, self.offset, _RWF_DONTCACHE)
+            except OSError:  # an older kernel, another file system; or the next call says so, too
+                self._uncached = False
+        return os.pwritev(number, parts, self.offset)
 
     def finish(self, *, replace: bool = True) -> None:
         """Check the file against what was written, close it and give it its final name.

@@ -318,8 +318,8 @@ class McapWriter:
         indexes = b"".join(index for _, _, index in body.indexes)
         whole: int | None = None
         if not compression:  # the data have been summed already
-            whole = joined_crc(crc32(head), crc, size)
-            whole = joined_crc(whole, crc32(indexes), len(indexes))
+            whole = joined_crc(crc32(head, self._sink.crc), crc, size)
+            whole = crc32(indexes, whole)
         self._write(head, *data, indexes, crc=whole)
         self._summary.add_chunk(
             body,
