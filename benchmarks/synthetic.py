@@ -16,14 +16,8 @@ import numpy as np
 
 from rsltrace.trace import segments
 from rsltrace.trace.chain import hash64
-from rsltrace.trace.format import (
-    CDR_HEADER,
-    EVENT_DTYPE,
-    EVENT_REST_DTYPE,
-    OUTPUT_DTYPE,
-    OUTPUT_HASHED,
-    SEGMENT_DTYPE,
-)
+from rsltrace.trace.dtypes import EVENT_DTYPE, EVENT_REST_DTYPE, OUTPUT_DTYPE, SEGMENT_DTYPE
+from rsltrace.trace.format import CDR_HEADER, OUTPUT_HASHED
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.writer import TraceWriter

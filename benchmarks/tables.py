@@ -19,7 +19,8 @@ import pyarrow
 from mcap.reader import make_reader
 from synthetic import Shape, write_trace
 
-from rsltrace.trace.format import CDR_HEADER, EVENT_DTYPE, EVENT_REST, TOPIC_EVENTS
+from rsltrace.trace.dtypes import EVENT_DTYPE
+from rsltrace.trace.format import CDR_HEADER, EVENT_REST, TOPIC_EVENTS
 from rsltrace.trace.reader import Trace
 
 EVENTS = 1_000_000

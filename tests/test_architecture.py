@@ -46,7 +46,7 @@ def test_help_and_version_load_nothing_heavy() -> None:
         ("rsltrace.simulation.loop.loop", set()),
         ("rsltrace.trace.model.event", set()),
         ("rsltrace.job", {"pydantic", "ruamel"}),
-        ("rsltrace.trace.reader", {"numpy"}),
+        ("rsltrace.trace.reader", set()),
         ("rsltrace.trace.writer", {"numpy"}),
     ],
 )

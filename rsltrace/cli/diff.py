@@ -269,9 +269,7 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
         return diff_bags(a, b, options)
     if options.by != BY_ORDER:
         raise click.UsageError("--by needs a recording: the events of two traces are aligned")
-    from rsltrace.cli.output.search_progress import working
     from rsltrace.diff.traces.diff import diff_traces
-    from rsltrace.trace.contents import check_contents
 
     with _opened(a) as trace_a, _opened(b) as trace_b:
         for trace, wanted in ((trace_a, check_a), (trace_b, check)):
@@ -281,6 +279,9 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
                     "nothing to compare; record the job again"
                 )
             if wanted:
+                from rsltrace.cli.output.search_progress import working
+                from rsltrace.trace.contents import check_contents
+
                 with working(f"checking {trace.name}"):
                     trace.check()
                     check_contents(trace)

@@ -35,8 +35,9 @@ from rsltrace.trace.model.texts import (
     format_seconds,
     printable,
 )
-from rsltrace.trace.native import DurationStatistics, busy_threads, callback_figures, is_native
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.timings import DurationStatistics, busy_threads, callback_figures
 from rsltrace.trace.words.code import entity_places, places_text
 from rsltrace.trace.words.kinds import kind_label
 from rsltrace.trace.words.phrases import table

@@ -64,7 +64,6 @@ def diff_files(
     from rsltrace.diff.options import BY_ORDER, DiffOptions
     from rsltrace.diff.traces.diff import diff_traces
     from rsltrace.errors import TraceError
-    from rsltrace.trace.contents import check_contents
     from rsltrace.trace.reader import Trace
 
     chosen = DiffOptions(
@@ -89,6 +88,8 @@ def diff_files(
         raise TraceError(f"by={by!r} is for recordings; the events of two traces are aligned")
     with Trace.open(a) as trace_a, Trace.open(b) as trace_b:
         for trace in (trace_a, trace_b) if check else ():
+            from rsltrace.trace.contents import check_contents  # it needs numpy
+
             trace.check()
             check_contents(trace)
         return diff_traces(trace_a, trace_b, chosen)

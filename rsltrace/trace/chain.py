@@ -14,13 +14,16 @@ XXH3 is not cryptographic: it finds differences, but cannot stop somebody who wa
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
 import xxhash
 
-from rsltrace.trace.format import EVENT_DTYPE, EVENT_REST_DTYPE, OUTPUT_HASHED
+from rsltrace.trace.format import EVENT_REST, OUTPUT_HASHED
 from rsltrace.trace.model.entity import Entity
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 hash64 = xxhash.xxh3_64_intdigest
 """``hash64(data: bytes, seed: int = 0) -> int``: XXH3-64. The library's own function without a
@@ -52,9 +55,9 @@ def verify_chain(events: npt.NDArray[np.void], previous: int = 0) -> int | None:
     ``events`` is EVENT_DTYPE, shape (n,); ``previous`` is the chain hash before the first (0 at the
     start). Returns the position of the first event whose chain hash is wrong, or None.
     """
-    packed = np.ascontiguousarray(events, dtype=EVENT_DTYPE).tobytes()
-    size = EVENT_DTYPE.itemsize
-    start_of_rest = size - EVENT_REST_DTYPE.itemsize
+    packed = events.tobytes()
+    size = events.itemsize
+    start_of_rest = size - EVENT_REST.size
     hashes: list[int] = events["chain_hash"].tolist()
     for position, chain_hash in enumerate(hashes):
         offset = position * size

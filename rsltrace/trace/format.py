@@ -1,16 +1,13 @@
 """Names, layouts and limits of the trace format, described in ``docs/trace-format.md``.
 
 A trace is a ROS 2 MCAP file. Events and outputs are CDR messages of fixed size in their own chunks,
-so that a reader can view a chunk as one numpy array without parsing it.
+so that a reader can view a chunk as one numpy array without parsing it (``trace.dtypes``).
 """
 
 from __future__ import annotations
 
 import struct
 
-import numpy as np
-
-from rsltrace.trace.mcap.chunk_builder import MESSAGE_HEADER_DTYPE
 from rsltrace.trace.mcap.records import McapHeader
 from rsltrace.trace.model.event import SEGMENT_EVENTS
 
@@ -151,23 +148,6 @@ string stack         # lines of user code, innermost first
 EVENT_REST = struct.Struct("<QQQQQQIIIBB")
 """A CallbackEvent after its chain hash: the bytes that the chain hash covers."""
 
-EVENT_REST_DTYPE = np.dtype(
-    [
-        ("index", "<u8"),
-        ("stamp", "<u8"),
-        ("cause_event", "<u8"),
-        ("input_hash", "<u8"),
-        ("output_hash", "<u8"),
-        ("state_hash", "<u8"),
-        ("entity", "<u4"),
-        ("cause_output", "<u4"),
-        ("outputs", "<u4"),
-        ("kind", "u1"),
-        ("flags", "u1"),
-    ]
-)
-EVENT_DTYPE = np.dtype([("chain_hash", "<u8"), *EVENT_REST_DTYPE.descr])
-
 OUTPUT = struct.Struct("<QQIII")
 OUTPUT_HASHED = slice(8, 24)
 """The bytes of an output (hash, entity, kind) that the event's output hash covers. Without the
@@ -176,46 +156,24 @@ sequence, so that events with the same outputs hash equally."""
 OUTPUT_CONTENT = struct.Struct("<QII")
 """Only these bytes: hash, entity, kind."""
 
-OUTPUT_CONTENT_DTYPE = np.dtype([("hash", "<u8"), ("entity", "<u4"), ("kind", "<u4")])
-OUTPUT_DTYPE = np.dtype([("event", "<u8"), *OUTPUT_CONTENT_DTYPE.descr, ("sequence", "<u4")])
-
 TIMING = struct.Struct("<8QI")
 
-TIMING_DTYPE = np.dtype(
-    [
-        ("event", "<u8"),
-        ("steady", "<u8"),
-        ("wall", "<u8"),
-        ("duration", "<u8"),
-        ("observer", "<u8"),
-        ("source", "<u8"),
-        ("ready", "<u8"),
-        ("sequence", "<u8"),
-        ("thread", "<u4"),
-    ]
+SEGMENT_COLUMNS = (
+    "first_event",
+    "events",
+    "first_output",
+    "outputs",
+    "chain_hash",
+    "start_stamp",
+    "end_stamp",
+    "events_offset",
+    "events_length",
+    "outputs_offset",
+    "outputs_length",
 )
-
-EVENT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *EVENT_DTYPE.descr])
-OUTPUT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *OUTPUT_DTYPE.descr])
-
-SEGMENT_DTYPE = np.dtype(
-    [
-        ("first_event", "<u8"),
-        ("events", "<u8"),
-        ("first_output", "<u8"),
-        ("outputs", "<u8"),
-        ("chain_hash", "<u8"),
-        ("start_stamp", "<u8"),
-        ("end_stamp", "<u8"),
-        ("events_offset", "<u8"),
-        ("events_length", "<u8"),
-        ("outputs_offset", "<u8"),
-        ("outputs_length", "<u8"),
-    ]
-)
-"""One row per segment of the attachment ``rsltrace/segments``. ``first_output`` counts from the
-start of the run; ``chain_hash`` is that of the segment's last event; offsets and lengths are those
-of the Chunk records (0 and 0: no outputs)."""
+"""Those of the attachment ``rsltrace/segments``, one row per segment of unsigned 64-bit integers.
+``first_output`` counts from the start of the run; ``chain_hash`` is that of the segment's last
+event; offsets and lengths are those of the Chunk records (0 and 0: no outputs)."""
 
 
 def begins_a_trace(header: McapHeader) -> bool:

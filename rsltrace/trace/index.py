@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import chain
-from typing import NamedTuple
+from itertools import accumulate, chain
+from struct import unpack
+from typing import ClassVar, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 import xxhash
 from mcap.opcode import Opcode
 
@@ -22,7 +21,7 @@ from rsltrace.trace.format import (
     CHECKSUMS_KEY,
     FORMAT_VERSION,
     METADATA_FORMAT,
-    SEGMENT_DTYPE,
+    SEGMENT_COLUMNS,
 )
 from rsltrace.trace.mcap import chunk as mcap_chunk
 from rsltrace.trace.mcap import reader as mcap_reader
@@ -159,9 +158,23 @@ class ChunkEntry(NamedTuple):
     indexes: Mapping[int, RecordSpan]
 
 
+@dataclass(frozen=True, slots=True)
+class SegmentTable:
+    """The table of segments as it is in the file: rows of SEGMENT_COLUMNS."""
+
+    ROW_BYTES: ClassVar[int] = 8 * len(SEGMENT_COLUMNS)
+
+    packed: bytes = b""
+
+    def column(self, name: str) -> tuple[int, ...]:
+        """Return a column, without numpy."""
+        numbers = unpack(f"<{len(self.packed) // 8}Q", self.packed)
+        return numbers[SEGMENT_COLUMNS.index(name) :: len(SEGMENT_COLUMNS)]
+
+
 @dataclass(slots=True)
 class TraceIndex:
-    """Where everything is in a trace. ``segments`` is SEGMENT_DTYPE, shape (n,).
+    """Where everything is in a trace.
 
     ``checksums``: its own metadata have some. ``summary_start`` is the end of the data section (0:
     unknown). ``chunks_with`` returns the chunks with messages of some channels, in file order; only
@@ -176,7 +189,7 @@ class TraceIndex:
     attachments: dict[str, RecordSpan] = field(default_factory=dict)
     checksums: bool = False
     summary_start: int = 0
-    segments: npt.NDArray[np.void] = field(default_factory=lambda: np.zeros(0, SEGMENT_DTYPE))
+    segments: SegmentTable = SegmentTable()
     chunks_with: Callable[[frozenset[int]], list[ChunkEntry]] = lambda channels: []
 
     def take(self, summary: mcap_reader.McapSummary) -> None:
@@ -274,28 +287,23 @@ def not_a_trace_error(source: ByteSource, index: TraceIndex) -> TraceFormatError
     )
 
 
-def _read_segments(source: ByteSource, span: RecordSpan) -> npt.NDArray[np.void]:
+def _read_segments(source: ByteSource, span: RecordSpan) -> SegmentTable:
     data = read_attachment(source, span)
-    if len(data) % SEGMENT_DTYPE.itemsize:
+    if len(data) % SegmentTable.ROW_BYTES:
         raise damage_error(source, span.offset, ATTACHMENT_INDEX, "its length is not a multiple")
-    segments = np.frombuffer(data, dtype=SEGMENT_DTYPE)
-    size = np.uint64(source.size)
-    sound = all(
-        (
-            np.array_equal(segments["first_event"], _starts(segments["events"])),
-            np.array_equal(segments["first_output"], _starts(segments["outputs"])),
-            bool((segments["events"] > 0).all()),
-            bool((segments["events_offset"] <= size).all()),
-            bool((segments["events_length"] <= size).all()),
-            bool((segments["outputs_offset"] <= size).all()),
-            bool((segments["outputs_length"] <= size).all()),
-        )
+    table = SegmentTable(data)
+    places = ("events_offset", "events_length", "outputs_offset", "outputs_length")
+    sound = (
+        table.column("first_event") == _starts(table.column("events"))
+        and table.column("first_output") == _starts(table.column("outputs"))
+        and 0 not in table.column("events")
+        and all(max(table.column(name), default=0) <= source.size for name in places)
     )
     if not sound:
         raise damage_error(source, span.offset, ATTACHMENT_INDEX, "its rows contradict each other")
-    return segments
+    return table
 
 
-def _starts(counts: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+def _starts(counts: tuple[int, ...]) -> tuple[int, ...]:
     """Return where each count begins, counting from 0."""
-    return np.cumsum(counts, dtype=np.uint64) - counts
+    return tuple(accumulate(counts, initial=0))[:-1]

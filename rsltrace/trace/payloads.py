@@ -10,9 +10,8 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import chain
+from struct import Struct
 
-import numpy as np
-import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
@@ -32,7 +31,8 @@ from rsltrace.trace.mcap.source import ByteSource
 _CHUNKS_CACHED = 4
 """Payload chunks have about half a megabyte; two topics side by side need two."""
 
-_INDEX_DTYPE = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+_INDEX_ENTRY = Struct("<QQ")
+"""Of a message: its time, and its offset in the chunk."""
 
 
 class PayloadReader:
@@ -182,15 +182,13 @@ class PayloadReader:
             if fields.u16() != channel_id:
                 raise DamageError("it is that of another channel")
             entries = fields.take(fields.u32())
-            if len(entries) % _INDEX_DTYPE.itemsize:
+            if len(entries) % _INDEX_ENTRY.size:
                 raise DamageError("an entry is cut off")
         except DamageError as error:
             raise damage_error(
                 self._source, index_span.offset, "the message index", error
             ) from error
-        table: npt.NDArray[np.void] = np.frombuffer(entries, dtype=_INDEX_DTYPE)
-        offsets: list[int] = table["offset"].tolist()
-        return offsets
+        return [offset for _, offset in _INDEX_ENTRY.iter_unpack(entries)]
 
     def _missing(self, channel_id: int, sequence: int) -> TraceError:
         info = self._index.channels.get(channel_id)

@@ -14,13 +14,11 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
-import numpy as np
-import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.cdr import unpack_code_line, unpack_detail, unpack_entity, unpack_finding
-from rsltrace.trace.chain import digest_text, hash64, verify_chain
+from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
     METADATA_ENVIRONMENT,
@@ -29,8 +27,6 @@ from rsltrace.trace.format import (
     METADATA_NATIVE,
     METADATA_OWN,
     METADATA_RESULT,
-    OUTPUT_DTYPE,
-    OUTPUT_HASHED,
     PREFIX_OWN,
     PREFIX_REQUEST,
     PREFIX_RESPONSE,
@@ -66,11 +62,14 @@ from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, EventRecord, Outpu
 from rsltrace.trace.model.finding import Finding, GuardCount, GuardMode, parse_counts
 from rsltrace.trace.model.texts import Stamp, format_seconds
 from rsltrace.trace.payloads import PayloadReader
-from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from rsltrace.trace.decode import Decoder, Decoders
     from rsltrace.trace.leaves import ValueField
+    from rsltrace.trace.segments import SegmentReader
     from rsltrace.trace.tables import TraceTables
 
 # Checking a whole trace: every byte against the file's checksum, every event against its hashes.
@@ -121,49 +120,6 @@ def _add_unique(summary: McapSummary, opcode: int, body: bytes) -> None:
         raise DamageError("a channel or schema is defined twice, in two ways")
 
 
-def check_hashes(source: ByteSource, segments: SegmentReader) -> None:
-    """Raise TraceError unless all chain hashes and output hashes follow from the contents."""
-    previous = 0
-    for segment in range(len(segments.table)):
-        events = segments.events(segment)
-        wrong = verify_chain(events, previous)
-        if wrong is not None:
-            raise TraceError(
-                f"{source.name}: the chain hash of event {events[wrong]['index']} is not that of "
-                "its contents; the trace was changed after it was recorded"
-            )
-        previous = int(events["chain_hash"][-1])
-        outputs = segments.outputs(segment)
-        counts = events["outputs"]
-        if sum(counts.tolist()) != len(outputs) or not np.array_equal(
-            outputs["event"], np.repeat(events["index"], counts)
-        ):
-            raise TraceError(
-                f"{source.name}: the outputs of the events from {events[0]['index']} on are not "
-                "as many as the events say; the trace was changed after it was recorded"
-            )
-        _check_output_hashes(source, events, outputs)
-
-
-def _check_output_hashes(
-    source: ByteSource, events: npt.NDArray[np.void], outputs: npt.NDArray[np.void]
-) -> None:
-    packed = np.ascontiguousarray(outputs, dtype=OUTPUT_DTYPE).tobytes()
-    size = OUTPUT_DTYPE.itemsize
-    position = 0
-    rows = zip(events["outputs"].tolist(), events["output_hash"].tolist(), strict=True)
-    for number, (count, expected) in enumerate(rows):
-        folded = 0
-        for _ in range(count):
-            folded = hash64(packed[position : position + size][OUTPUT_HASHED], folded)
-            position += size
-        if folded != expected:
-            raise TraceError(
-                f"{source.name}: the output hash of event {events[number]['index']} is not that of "
-                "its outputs; the trace was changed after it was recorded"
-            )
-
-
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -197,12 +153,6 @@ class Trace:
                     raise TraceError(f"{source.name} has no channel {topic}; it is no whole trace")
             self._index = index
             self._ids_of_topic = ids
-            self._segments = SegmentReader(
-                source,
-                index.segments,
-                ids.get(TOPIC_EVENTS, [0])[0],
-                ids.get(TOPIC_OUTPUTS, [0])[0],
-            )
             self._payloads = PayloadReader(source, index)
             self._decoders: Decoders | None = None
             if not index.complete:  # a name may be damaged, too
@@ -226,7 +176,8 @@ class Trace:
     def close(self) -> None:
         """Close the file. Arrays returned before stay valid."""
         self._source.close()
-        self._segments.forget()
+        if "_segments" in vars(self):
+            self._segments.forget()
 
     def __enter__(self) -> Trace:
         return self
@@ -262,28 +213,30 @@ class Trace:
     @property
     def digest(self) -> str:
         """The last chain hash as 16 hex digits, equal for equal runs (no events: zeros)."""
-        table = self.segments
-        return digest_text(int(table["chain_hash"][-1]) if len(table) else 0)
+        hashes = self._index.segments.column("chain_hash")
+        return digest_text(hashes[-1] if hashes else 0)
 
-    @property
+    @cached_property
     def event_count(self) -> int:
         """The number of events."""
-        return int(self.segments["events"].sum(dtype=np.uint64))
+        return sum(self._index.segments.column("events"))
 
-    @property
+    @cached_property
     def output_count(self) -> int:
         """The number of outputs of all events."""
-        return int(self.segments["outputs"].sum(dtype=np.uint64))
+        return sum(self._index.segments.column("outputs"))
 
-    @property
+    @cached_property
     def start_ns(self) -> int:
         """The start of the run, by its result or its earliest event (0: none)."""
-        return self._result_ns("start_time", min(self.segments["start_stamp"].tolist(), default=0))
+        starts = self._index.segments.column("start_stamp")
+        return self._result_ns("start_time", min(starts, default=0))
 
-    @property
+    @cached_property
     def end_ns(self) -> int:
         """The end of the run, by its result or its latest event (0: none)."""
-        return self._result_ns("end_time", max(self.segments["end_stamp"].tolist(), default=0))
+        ends = self._index.segments.column("end_stamp")
+        return self._result_ns("end_time", max(ends, default=0))
 
     @property
     def ended_after(self) -> int | None:
@@ -340,6 +293,8 @@ class Trace:
         if self._index.summary_start:
             check_data_section(self._source, self._index.summary_start)
             check_records(self._source, self._index)
+        from rsltrace.trace.segments import check_hashes
+
         check_hashes(self._source, self._segments)
         self._payloads.check()
 
@@ -373,6 +328,18 @@ class Trace:
         """The table of segments: SEGMENT_DTYPE, shape (segments,)."""
         return self._segments.table
 
+    @cached_property
+    def _segments(self) -> SegmentReader:
+        # It needs numpy, which takes as long to load as all else that an equal run is found with.
+        from rsltrace.trace.segments import SegmentReader
+
+        return SegmentReader(
+            self._source,
+            self._index.segments,
+            self._ids_of_topic.get(TOPIC_EVENTS, [0])[0],
+            self._ids_of_topic.get(TOPIC_OUTPUTS, [0])[0],
+        )
+
     def events(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]:
         """Yield the events ``first <= index < last`` as arrays of EVENT_DTYPE, one per segment.
 
@@ -384,24 +351,16 @@ class Trace:
     def outputs(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]:
         """Yield the outputs of the events ``first <= index < last``: OUTPUT_DTYPE, per segment."""
         for segment, begin, end in self._pieces(first, last):
-            outputs = self._segments.cached_outputs(segment)
             start = int(self.segments["first_event"][segment])
-            bounds = np.array([start + begin, start + end], dtype=np.uint64)
-            low, high = np.searchsorted(outputs["event"], bounds).tolist()
-            yield outputs[low:high]
+            yield self._segments.outputs_between(segment, start + begin, start + end)
 
     def event(self, index: int) -> EventRecord:
         """Return event number ``index``. Raises IndexError if there is none."""
-        segment = self._segment_of(index)
-        first = int(self.segments["first_event"][segment])
-        return event_of(self._segments.cached_events(segment)[index - first], self.name)
+        return self._segments.event(self._segment_of(index), index)
 
     def outputs_of(self, index: int) -> list[Output]:
         """Return the outputs of event ``index``, in order. Raises IndexError if there is none."""
-        outputs = self._segments.cached_outputs(self._segment_of(index))
-        bounds = np.array([index, index + 1], dtype=np.uint64)
-        low, high = np.searchsorted(outputs["event"], bounds).tolist()
-        return [output_of(row, self.name) for row in outputs[low:high]]
+        return self._segments.outputs_of(self._segment_of(index), index)
 
     @cached_property
     def findings(self) -> dict[int, list[Finding]]:

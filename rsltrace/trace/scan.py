@@ -14,9 +14,9 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError, TraceFormatError
+from rsltrace.trace.dtypes import SEGMENT_DTYPE
 from rsltrace.trace.format import (
     METADATA_FORMAT,
-    SEGMENT_DTYPE,
     TOPIC_DETAILS,
     TOPIC_ENTITIES,
     TOPIC_EVENTS,
@@ -25,6 +25,7 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.index import (
     ChunkEntry,
+    SegmentTable,
     TraceIndex,
     check_version,
     messages_in,
@@ -86,7 +87,7 @@ class _Scanner:
             raise not_a_trace_error(self._source, index)
         index.take(summary)
         if self._rows:
-            index.segments = np.array(self._rows, dtype=SEGMENT_DTYPE)
+            index.segments = SegmentTable(np.array(self._rows, dtype=SEGMENT_DTYPE).tobytes())
         for entry in self._chunks:
             for channel_id, count in entry.counts.items():
                 total = index.message_counts.get(channel_id, 0) + count

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.format import (
-    CDR_HEADER,
+from rsltrace.trace.chain import hash64, verify_chain
+from rsltrace.trace.dtypes import (
     EVENT_DTYPE,
     EVENT_MESSAGE_DTYPE,
     EVENT_REST_DTYPE,
@@ -24,7 +24,8 @@ from rsltrace.trace.format import (
     OUTPUT_MESSAGE_DTYPE,
     SEGMENT_DTYPE,
 )
-from rsltrace.trace.index import damage_error, read_chunk
+from rsltrace.trace.format import CDR_HEADER, OUTPUT_HASHED
+from rsltrace.trace.index import SegmentTable, damage_error, read_chunk
 from rsltrace.trace.mcap.chunk_builder import ChunkBody, rows_chunk
 from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD, DamageError, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
@@ -177,15 +178,15 @@ class SegmentReader:
     def __init__(
         self,
         source: ByteSource,
-        table: npt.NDArray[np.void],
+        table: SegmentTable,
         event_channel: int,
         output_channel: int,
     ) -> None:
-        self.table = table
+        self.table = np.frombuffer(table.packed, dtype=SEGMENT_DTYPE)
         self._source = source
         self._event_channel = event_channel
         self._output_channel = output_channel
-        self._first_events = table["first_event"]
+        self._first_events = self.table["first_event"]
         # Caches per object, so that they end with the trace.
         self.cached_events = lru_cache(maxsize=_SEGMENTS_CACHED)(self.events)
         self.cached_outputs = lru_cache(maxsize=_SEGMENTS_CACHED)(self.outputs)
@@ -198,6 +199,24 @@ class SegmentReader:
     def segment_of(self, event: int) -> int:
         """Return the number of the segment that contains ``event`` (which must exist)."""
         return int(np.searchsorted(self._first_events, np.uint64(event), side="right")) - 1
+
+    def event(self, segment: int, index: int) -> EventRecord:
+        """Return an event of a segment. Raises TraceError."""
+        row = self.cached_events(segment)[index - int(self._first_events[segment])]
+        return event_of(row, self._source.name)
+
+    def outputs_of(self, segment: int, index: int) -> list[Output]:
+        """Return the outputs of an event of a segment, in order. Raises TraceError."""
+        rows = self.outputs_between(segment, index, index + 1)
+        return [output_of(row, self._source.name) for row in rows]
+
+    def outputs_between(self, segment: int, first: int, last: int) -> npt.NDArray[np.void]:
+        """Return the outputs of the events ``first <= index < last`` of a segment: OUTPUT_DTYPE,
+        shape (n,). Raises TraceError."""
+        outputs = self.cached_outputs(segment)
+        bounds = np.array([first, last], dtype=np.uint64)
+        low, high = np.searchsorted(outputs["event"], bounds).tolist()
+        return outputs[low:high]
 
     def events(self, segment: int) -> npt.NDArray[np.void]:
         """Return the events of a segment: EVENT_DTYPE, shape (n,), read-only. Raises TraceError."""
@@ -235,6 +254,49 @@ class SegmentReader:
         except DamageError as error:
             raise damage_error(self._source, span.offset, "the outputs chunk", error) from error
         return outputs
+
+
+def check_hashes(source: ByteSource, segments: SegmentReader) -> None:
+    """Raise TraceError unless all chain hashes and output hashes follow from the contents."""
+    previous = 0
+    for segment in range(len(segments.table)):
+        events = segments.events(segment)
+        wrong = verify_chain(events, previous)
+        if wrong is not None:
+            raise TraceError(
+                f"{source.name}: the chain hash of event {events[wrong]['index']} is not that of "
+                "its contents; the trace was changed after it was recorded"
+            )
+        previous = int(events["chain_hash"][-1])
+        outputs = segments.outputs(segment)
+        counts = events["outputs"]
+        if sum(counts.tolist()) != len(outputs) or not np.array_equal(
+            outputs["event"], np.repeat(events["index"], counts)
+        ):
+            raise TraceError(
+                f"{source.name}: the outputs of the events from {events[0]['index']} on are not "
+                "as many as the events say; the trace was changed after it was recorded"
+            )
+        _check_output_hashes(source, events, outputs)
+
+
+def _check_output_hashes(
+    source: ByteSource, events: npt.NDArray[np.void], outputs: npt.NDArray[np.void]
+) -> None:
+    packed = np.ascontiguousarray(outputs, dtype=OUTPUT_DTYPE).tobytes()
+    size = OUTPUT_DTYPE.itemsize
+    position = 0
+    rows = zip(events["outputs"].tolist(), events["output_hash"].tolist(), strict=True)
+    for number, (count, expected) in enumerate(rows):
+        folded = 0
+        for _ in range(count):
+            folded = hash64(packed[position : position + size][OUTPUT_HASHED], folded)
+            position += size
+        if folded != expected:
+            raise TraceError(
+                f"{source.name}: the output hash of event {events[number]['index']} is not that of "
+                "its outputs; the trace was changed after it was recorded"
+            )
 
 
 def segment_row(

@@ -21,12 +21,12 @@ from rsltrace.errors import OutputError
 from rsltrace.trace import segments
 from rsltrace.trace.cdr import pack_code_line, pack_detail, pack_entity, pack_finding
 from rsltrace.trace.chain import digest_text
+from rsltrace.trace.dtypes import EVENT_REST_DTYPE, OUTPUT_CONTENT_DTYPE, SEGMENT_DTYPE
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
     CDR_HEADER,
     CHECKSUM_KEY,
     CHECKSUMS_KEY,
-    EVENT_REST_DTYPE,
     EVENTS_PER_SEGMENT,
     FORMAT_VERSION,
     LIBRARY,
@@ -34,7 +34,6 @@ from rsltrace.trace.format import (
     METADATA_FORMAT,
     METADATA_RESULT,
     METADATA_ROSBAG2,
-    OUTPUT_CONTENT_DTYPE,
     OUTPUTS_PER_SEGMENT,
     PAYLOAD_BYTES_PER_CHUNK,
     PROFILE,
@@ -47,7 +46,6 @@ from rsltrace.trace.format import (
     SCHEMA_STATE,
     SCHEMA_TEXT,
     SCHEMA_TIMING,
-    SEGMENT_DTYPE,
     TOPIC_CODE_LINES,
     TOPIC_DETAILS,
     TOPIC_ENTITIES,

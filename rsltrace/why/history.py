@@ -20,8 +20,9 @@ from rsltrace.trace.model.event import (
     decision_duration,
     decision_kind,
 )
-from rsltrace.trace.native import event_columns, is_native
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.timings import event_columns
 
 LOSSES = (RandomDecision.DROP, RandomDecision.BURST, RandomDecision.OUTAGE)
 _SENT = {

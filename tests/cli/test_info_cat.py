@@ -466,6 +466,7 @@ _HEAVY = (
             (
                 *("rsltrace.diff.causes", "rsltrace.diff.traces.comparison", "rsltrace.diff.bags"),
                 *("rsltrace.diff.alignment.align", "rsltrace.conditions", "rsltrace.trace.decode"),
+                *("numpy", "rsltrace.trace.segments", "rsltrace.cli.output.search_progress"),
             ),
         ),
     ],

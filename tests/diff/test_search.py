@@ -11,7 +11,7 @@ from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, S
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.alignment.rows import first_difference
+from rsltrace.diff.alignment.divergence import first_difference
 from rsltrace.errors import TraceError
 from rsltrace.trace.mcap.source import FileSource
 from rsltrace.trace.reader import Trace

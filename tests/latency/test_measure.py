@@ -20,14 +20,8 @@ from rsltrace.checks.latency.measure import MEASURES, ChainLatency, measure_late
 from rsltrace.checks.latency.paths import Hop
 from rsltrace.errors import TraceError
 from rsltrace.job.parts.check import LatencySpec
-from rsltrace.trace.format import (
-    CDR_HEADER,
-    EVENT_DTYPE,
-    METADATA_NATIVE,
-    OUTPUT_DTYPE,
-    TIMING,
-    TOPIC_TIMINGS,
-)
+from rsltrace.trace.dtypes import EVENT_DTYPE, OUTPUT_DTYPE
+from rsltrace.trace.format import CDR_HEADER, METADATA_NATIVE, TIMING, TOPIC_TIMINGS
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,

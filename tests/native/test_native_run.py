@@ -18,8 +18,9 @@ from rsltrace.diff.traces.native import said_of_parameters
 from rsltrace.trace.contents import check_contents
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
-from rsltrace.trace.native import callback_figures, is_native, timings
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.timings import callback_figures, timings
 from tests.native.running import (
     COMMAND,
     PATIENCE_S,

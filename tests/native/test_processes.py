@@ -19,8 +19,8 @@ import pytest
 from rsltrace.trace.contents import check_contents
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
-from rsltrace.trace.native import callback_figures, timings
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.timings import callback_figures, timings
 from tests.native.running import (
     COMMAND,
     PATIENCE_S,

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.trace.chain import digest_text, hash64, output_hash, verify_chain
-from rsltrace.trace.format import EVENT_DTYPE, EVENT_REST, OUTPUT
+from rsltrace.trace.dtypes import EVENT_DTYPE
+from rsltrace.trace.format import EVENT_REST, OUTPUT
 
 U64 = st.integers(0, 2**64 - 1)
 

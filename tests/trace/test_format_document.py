@@ -13,6 +13,7 @@ import xxhash
 import zstandard
 from trace_maker import write_run
 
+from rsltrace.trace import dtypes
 from rsltrace.trace import format as layout
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
@@ -157,7 +158,7 @@ def test_the_document_names_every_constant_of_the_format() -> None:
     for value in constants:
         assert value.rstrip("/") in text, value
     assert f"version {layout.FORMAT_VERSION}" in text.splitlines()[0]
-    for dtype in (layout.EVENT_DTYPE, layout.OUTPUT_DTYPE, layout.SEGMENT_DTYPE):
+    for dtype in (dtypes.EVENT_DTYPE, dtypes.OUTPUT_DTYPE, dtypes.SEGMENT_DTYPE):
         for name in dtype.names:
             assert re.search(rf"\b{name}\b", text), name
 
@@ -175,15 +176,15 @@ def test_the_document_gives_every_number_of_a_kind() -> None:
 def test_the_document_gives_the_sizes() -> None:
     text = DOCUMENT.read_text()
     for layout_, size in (
-        (layout.EVENT_MESSAGE_DTYPE, 105),
-        (layout.OUTPUT_MESSAGE_DTYPE, 63),
-        (layout.EVENT_DTYPE, 70),
-        (layout.OUTPUT_DTYPE, 28),
-        (layout.SEGMENT_DTYPE, 88),
+        (dtypes.EVENT_MESSAGE_DTYPE, 105),
+        (dtypes.OUTPUT_MESSAGE_DTYPE, 63),
+        (dtypes.EVENT_DTYPE, 70),
+        (dtypes.OUTPUT_DTYPE, 28),
+        (dtypes.SEGMENT_DTYPE, 88),
     ):
         assert layout_.itemsize == size
         assert f"{size} bytes" in text
-    for dtype in (layout.EVENT_DTYPE, layout.OUTPUT_DTYPE):
+    for dtype in (dtypes.EVENT_DTYPE, dtypes.OUTPUT_DTYPE):
         for name, (_, offset) in dtype.fields.items():
             assert re.search(rf"^\| {offset} \| u\d+ \| {name} \|", text, re.MULTILINE), name
     assert f"{layout.OUTPUTS_PER_SEGMENT:,} outputs" in text

@@ -14,7 +14,8 @@ from trace_maker import Feeder, Opened, boundaries, opcodes, write_run
 
 from rsltrace.errors import TraceError, TraceFormatError
 from rsltrace.trace import index as index_module
-from rsltrace.trace.format import EVENT_DTYPE, EVENTS_PER_SEGMENT, OUTPUT_DTYPE
+from rsltrace.trace.dtypes import EVENT_DTYPE, OUTPUT_DTYPE
+from rsltrace.trace.format import EVENTS_PER_SEGMENT
 from rsltrace.trace.index import read_chunk
 from rsltrace.trace.mcap.records import RecordSpan
 from rsltrace.trace.mcap.source import FileSource

@@ -30,8 +30,9 @@ from rsltrace.trace.model.event import (
     encode_decision,
 )
 from rsltrace.trace.model.operation import NODE_TOPICS
-from rsltrace.trace.native import event_columns, is_native, timings
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.timings import event_columns, timings
 
 # When callbacks of a native run really ended, and when its messages really left and arrived.
 #

@@ -12,82 +12,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind, RandomDecision, encode_decision
 from rsltrace.trace.reader import Trace
-
-# Where two runs diverge: a binary search over chain hashes, which cover all events before.
-#
-# Both files carry the chain hash at the end of each segment. Where they end a segment at the same
-# event, as two recordings of one job do, no event is read until the one segment is found that
-# holds the difference. Where they are cut differently, each step of the search reads one segment.
-
-
-def first_difference(a: Trace, b: Trace) -> int | None:
-    """Return the index of the first event that differs in any way, or None if none does.
-
-    Where one run is the beginning of the other it is the number of events of the shorter one.
-    Raises TraceError if a segment that has to be read is damaged.
-    """
-    count_a, count_b = a.event_count, b.event_count
-    if count_a == count_b and a.digest == b.digest:
-        return None
-    low, high = _between_common_ends(a, b)
-    # Two runs agree up to an event if their chain hashes agree there; that is so up to ``low``
-    # and, if ``high`` is an event of both, not so there. Every end of a segment is a try for free
-    # in the one trace and one segment to read in the other.
-    for known, other in ((a, b), (b, a)):
-        low, high = _narrow(known, other, low, high)
-    for mine, theirs in _pieces(a, b, low, high):
-        differ = mine["chain_hash"] != theirs["chain_hash"]
-        if differ.any():
-            return int(mine["index"][int(np.argmax(differ))])
-    return high
-
-
-def _between_common_ends(a: Trace, b: Trace) -> tuple[int, int]:
-    """Return (events that surely agree, events among which the difference is), at segment ends."""
-    ends_a, ends_b = _ends(a), _ends(b)
-    common, in_a, in_b = np.intersect1d(ends_a, ends_b, assume_unique=True, return_indices=True)
-    agree = a.segments["chain_hash"][in_a] == b.segments["chain_hash"][in_b]
-    first_bad = int(np.argmin(agree)) if not agree.all() else len(common)
-    low = int(common[first_bad - 1]) if first_bad else 0
-    high = int(common[first_bad]) if first_bad < len(common) else min(a.event_count, b.event_count)
-    return low, high
-
-
-def _narrow(known: Trace, other: Trace, low: int, high: int) -> tuple[int, int]:
-    """Bisect over the ends of ``known``'s segments that lie between ``low`` and ``high``."""
-    ends = _ends(known)
-    first, last = np.searchsorted(ends, np.array([low, high], dtype=np.uint64), side="right")
-    begin, end = int(first), int(last)
-    while begin < end:
-        middle = (begin + end) // 2
-        events = int(ends[middle])
-        if events >= high:
-            end = middle
-        elif known.segments["chain_hash"][middle] == other.event(events - 1).chain_hash:
-            low, begin = events, middle + 1
-        else:
-            high, end = events, middle
-    return low, high
-
-
-def _pieces(
-    a: Trace, b: Trace, low: int, high: int
-) -> list[tuple[npt.NDArray[np.void], npt.NDArray[np.void]]]:
-    """Return the events ``low <= index < high`` of both; by now they lie in one segment each."""
-    return list(zip(a.events(low, high), b.events(low, high), strict=True))
-
-
-def _ends(trace: Trace) -> npt.NDArray[np.uint64]:
-    table = trace.segments
-    ends: npt.NDArray[np.uint64] = table["first_event"] + table["events"]
-    return ends
-
 
 # The longest increasing subsequence: what two orders have in common at most.
 

@@ -14,7 +14,7 @@ from rsltrace.diff.facts.remarks import Remark
 from rsltrace.fast_dataclass import dataclass
 
 if TYPE_CHECKING:
-    from rsltrace.trace.native import DurationStatistics
+    from rsltrace.trace.timings import DurationStatistics
     from rsltrace.trace.words.entities import EntityKey
 
 

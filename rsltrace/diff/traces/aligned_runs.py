@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 from rsltrace.diff.alignment.aligned_rows import ALIGNED_MAX, AlignedRows
 from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks, EqualBlock
+from rsltrace.diff.alignment.divergence import first_difference
 from rsltrace.diff.alignment.entity_matching import match_entities
-from rsltrace.diff.alignment.rows import ComparedTrace, first_difference
+from rsltrace.diff.alignment.rows import ComparedTrace
 from rsltrace.diff.causes.effects import first_effect, is_setup
 from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.message_differences import message_differences

@@ -48,7 +48,8 @@ from rsltrace.diff.traces.ended_runs import (
     judge_end,
     who_ended,
 )
-from rsltrace.diff.traces.tolerance import interruptions, messages_within, side
+from rsltrace.diff.traces.sides import interruptions, side
+from rsltrace.diff.traces.tolerance import messages_within
 from rsltrace.errors import TraceError, near_or_all
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.texts import printable

@@ -28,13 +28,14 @@ from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.facts.remarks import LogTimesIgnored, NativeRuns
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
-from rsltrace.diff.traces.tolerance import interruptions, side
+from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind
 from rsltrace.trace.model.operation import PARAMETER_EVENTS
-from rsltrace.trace.native import DurationStatistics, duration_statistics, event_columns, is_native
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.timings import DurationStatistics, duration_statistics, event_columns
 from rsltrace.trace.words.entities import EntityKey
 
 NOT_COMPARED = ("stamp", "*.stamp", "/rosout:file")

@@ -10,43 +10,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.facts.remarks import Remark, TruncatedRecording
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result import BagDiff, ComparedRun
+from rsltrace.diff.result import BagDiff
 from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
-from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
-
-# What there is to know of each of the two runs as a whole.
-
-
-def stop_reason(trace: Trace) -> str:
-    """Return why a run ended, in words."""
-    if not trace.complete:
-        return "interrupted"
-    return trace.result.get("stop_reason") or "no reason given"
-
-
-def side(trace: Trace) -> ComparedRun:
-    """Return what there is to know of a run as a whole."""
-    return ComparedRun(
-        path=trace.name,
-        digest="" if is_native(trace) else trace.digest,
-        events=trace.event_count,
-        end_ns=trace.stamp(trace.end_ns),
-        complete=trace.complete,
-        stop_reason=stop_reason(trace),
-    )
-
-
-def interruptions(a: Trace, b: Trace) -> list[Remark]:
-    """Return a remark for each run whose recording was cut off."""
-    return [
-        TruncatedRecording(name, trace.name, trace.event_count, trace.end_ns)
-        for name, trace in (("a", a), ("b", b))
-        if not trace.complete
-    ]
-
 
 _SAME_EVENTS = "stamp entity kind flags outputs cause_event cause_output".split()
 _SAME_OUTPUTS = "event entity kind".split()

@@ -13,15 +13,9 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.format import METADATA_NATIVE
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind
-from rsltrace.trace.native import (
-    CUT_AFTER_NS,
-    event_columns,
-    is_native,
-    missing_numbers,
-    senders_of,
-    timings,
-)
+from rsltrace.trace.native import CUT_AFTER_NS, is_native
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.timings import event_columns, missing_numbers, senders_of, timings
 
 # Links, callbacks and executors with their times, as a native run had them.
 

@@ -20,8 +20,8 @@ from rsltrace.trace.model.event import (
     RandomDecision,
     decision_duration,
 )
-from rsltrace.trace.native import timings
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.timings import timings
 
 _CALLBACKS = frozenset(
     map(int, (EventKind.TIMER, EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT))

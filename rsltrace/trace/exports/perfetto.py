@@ -35,9 +35,10 @@ from rsltrace.trace.model.event import (
 from rsltrace.trace.model.finding import GuardMode
 from rsltrace.trace.model.regular_file import replacement_of
 from rsltrace.trace.model.texts import NS_PER_S, printable, shortened
-from rsltrace.trace.native import is_native, iterate_timings
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import output_of
+from rsltrace.trace.timings import iterate_timings
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.kinds import kind_label

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
+from rsltrace.trace.dtypes import EVENT_DTYPE, OUTPUT_DTYPE
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, EventRecord, Output, OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, printable

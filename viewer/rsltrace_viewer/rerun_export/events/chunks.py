@@ -11,7 +11,7 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from rsltrace.trace.format import OUTPUT_DTYPE
+from rsltrace.trace.dtypes import OUTPUT_DTYPE
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, printable
