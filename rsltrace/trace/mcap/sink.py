@@ -32,10 +32,11 @@ _PIECE_BYTES = 1 << 20
 _PARTS_MAX = 512
 """The number of parts in one call; Linux allows 1024."""
 _CACHED_BYTES = 1 << 30
-"""Beyond these, large writes do not stay in the kernel's cache (Linux 6.14): it would take all the
+"""Beyond these, what is on the disk does not stay in the kernel's cache: that would take all the
 memory that is free, at ten times the cost of the write where a hypervisor has yet to back it."""
-_UNCACHED_BYTES_MIN = 256 << 10
-_RWF_DONTCACHE = 0x80
+_RELEASED_BYTES = 64 << 20
+_WRITTEN_BACK_BYTES = 256 << 20
+"""How far back it is looked for what has reached the disk meanwhile."""
 
 
 def unfinished_path(path: Path) -> Path:
@@ -62,7 +63,7 @@ class Sink:
         self._process = os.getpid()
         self._written_ns = -1
         self._touched = False
-        self._uncached = sys.platform == "linux"
+        self._released = _CACHED_BYTES
         replaced = self._replaced = _replaceable_status(path) if force else None
         flags = _OPEN | os.O_CREAT
         if replaced is None:
@@ -118,22 +119,19 @@ class Sink:
         rest = [memoryview(part) for part in parts if part]
         while rest:
             # A full disk first writes a part, and fails at the next call.
-            count = self._write_some(number, rest[:_PARTS_MAX])
+            count = os.pwritev(number, rest[:_PARTS_MAX], self.offset)
             self.offset += count
             while rest and count >= len(rest[0]):
                 count -= len(rest.pop(0))
             if rest:
                 rest[0] = rest[0][count:]
+        if self.offset - self._released >= _RELEASED_BYTES and hasattr(os, "posix_fadvise"):
+            # Begins to write what has not been written back, and lets go of what has.
+            begin = max(self._released - _WRITTEN_BACK_BYTES, _CACHED_BYTES)
+            with suppress(OSError):  # it is advice
+                os.posix_fadvise(number, begin, self.offset - begin, os.POSIX_FADV_DONTNEED)
+            self._released = self.offset
         self._written_ns = os.fstat(number).st_mtime_ns
-
-    def _write_some(self, number: int, parts: list[memoryview]) -> int:
-        large = self.offset >= _CACHED_BYTES and sum(map(len, parts)) >= _UNCACHED_BYTES_MIN
-        if large and self._uncached:
-            try:
-                return os.pwritev(number, parts, self.offset, _RWF_DONTCACHE)
-            except OSError:  # an older kernel, another file system; or the next call says so, too
-                self._uncached = False
-        return os.pwritev(number, parts, self.offset)
 
     def finish(self, *, replace: bool = True) -> None:
         """Check the file against what was written, close it and give it its final name.
