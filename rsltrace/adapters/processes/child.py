@@ -17,6 +17,7 @@ from rsltrace.adapters.processes.wire import RECORD, CommandKind, WireError
 from rsltrace.child_processes import how_ended, kill_group
 from rsltrace.errors import JobError
 from rsltrace.guard.pin import fix_addresses
+from rsltrace.guard.redirect import copy_of
 
 # Memory that a process and the loop both see (``native/shared.h``): files in memory that grow.
 
@@ -38,16 +39,14 @@ class SharedMemory:
         self.size = len(self.data)
 
     def grow(self, size: int) -> None:
-        """Have room for so many bytes."""
-        if size > self.size:
-            os.ftruncate(self.fd, 2 * size)
-            self._look_again()
+        """Have room for twice so many bytes."""
+        os.ftruncate(self.fd, 2 * size)
+        self._look_again()
 
     def has(self, size: int) -> bool:
-        """Return whether there are so many bytes; the process may have made it grow."""
-        if size > self.size:
-            with suppress(OSError, ValueError):
-                self._look_again()
+        """Return whether there are so many bytes, now that the process may have made it grow."""
+        with suppress(OSError, ValueError):
+            self._look_again()
         return size <= self.size
 
     def close(self) -> None:
@@ -70,7 +69,7 @@ class ProcessMessages(SharedMemory):
         :raises WireError: if that is nothing that makes sense.
         """
         end = _LENGTH.size + _LENGTH.unpack_from(self.data)[0]
-        if not self.has(end):
+        if end > self.size and not self.has(end):
             raise WireError("a process has sent what is no batch")
         return self.data, _LENGTH.size, end
 
@@ -128,7 +127,8 @@ class Life:
         return states, ticks * _TICK_S
 
 
-_write = os.write  # the guard takes the place of the one in os, for nodes
+_write = copy_of(os.write)  # type: ignore[arg-type]  # these are not what the guard gives nodes
+_epoll = select.epoll
 _TURN = b"\0"
 _LOOK_S = 0.2
 _GRACE_S = 2.0
@@ -161,7 +161,7 @@ class ProcessEnd:
 class ProcessHandle:
     """A running executable with the library in it, in a process group of its own.
 
-    ``fixed`` and ``noise``: see ``ProcessProgram``.
+    ``fixed`` and ``noise``: see ``ProcessProgram``. What it has said lies in ``said``.
 
     :raises JobError: if it cannot be started.
     """
@@ -177,16 +177,17 @@ class ProcessHandle:
         noise: int = 0,
     ) -> None:
         self._name = name
-        self._said, self._told = ProcessMessages("rsltrace-said"), SharedMemory("rsltrace-told")
+        self.said, self._told = ProcessMessages("rsltrace-said"), SharedMemory("rsltrace-told")
         self._link = ExitStack()
         turns, self._turns = os.pipe()
-        self._bell = os.eventfd(0, os.EFD_CLOEXEC)
-        self._epoll = self._link.enter_context(select.epoll(2))
+        bell = os.eventfd(0, os.EFD_CLOEXEC)
+        epoll = self._link.enter_context(_epoll(2))
         self._link.callback(os.close, self._turns)
-        self._link.callback(os.close, self._bell)
-        self._epoll.register(self._bell, select.EPOLLIN | select.EPOLLET)  # needs no read
-        self._epoll.register(self._turns, 0)  # tells when nobody reads any more
-        files = (turns, self._bell, self._said.fd, self._told.fd)
+        self._link.callback(os.close, bell)
+        epoll.register(bell, select.EPOLLIN | select.EPOLLET)  # needs no read
+        epoll.register(self._turns, 0)  # tells when nobody reads any more
+        self._poll, self._rung = epoll.poll, (bell, select.EPOLLIN)
+        files = (turns, bell, self.said.fd, self._told.fd)
         # Of one length: the environment lies on the stack, and what comes after it moves.
         link = ":".join(f"{number:010d}" for number in (os.getpid(), *files, noise))
         try:
@@ -214,10 +215,14 @@ class ProcessHandle:
 
     def send(self, data: bytes) -> None:
         """Send to the process; one that is gone is noticed by ``receive``."""
-        self._told.grow(len(data))
-        self._told.data[: len(data)] = data
-        with suppress(BrokenPipeError):
+        told, size = self._told, len(data)
+        if size > told.size:
+            told.grow(size)
+        told.data[:size] = data
+        try:
             _write(self._turns, _TURN)
+        except BrokenPipeError:
+            pass
 
     def receive(self) -> Batch | None:
         """Return the next batch, None if the process has ended; it holds until ``taken``.
@@ -226,9 +231,9 @@ class ProcessHandle:
         """
         looks = 0
         while True:
-            events = dict(self._epoll.poll(_LOOK_S, 2))
-            if self._bell in events:
-                return self._said.batch()
+            events = self._poll(_LOOK_S, 2)
+            if self._rung in events:
+                return self.said.batch()
             # A process may be gone whose children have its end of the link.
             if events or self._process.poll() is not None:
                 return None
@@ -236,17 +241,6 @@ class ProcessHandle:
             if looks > self._patience:
                 self.kill()
                 return None
-
-    def taken(self) -> None:
-        """Let go of a batch: the process writes the next one to the same place."""
-        self._said.taken()
-
-    def left(self) -> Batch:
-        """Return what a process has said that has ended, after its last batch.
-
-        :raises WireError: if that is nothing that makes sense.
-        """
-        return self._said.batch()
 
     def give_up_after(self, seconds: float) -> None:
         """Kill the process if it says nothing for so long, by its own time (``Life``)."""
@@ -283,7 +277,7 @@ class ProcessHandle:
 
     def _close_files(self) -> None:
         self._link.close()
-        self._said.close()
+        self.said.close()
         self._told.close()
 
 

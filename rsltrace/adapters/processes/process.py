@@ -239,7 +239,7 @@ class Process:
             if batch is None:
                 self._has_ended()
                 return
-            self.child.taken()
+            self.child.said.taken()
             if answer is None:
                 return
             self.child.send(answer)
@@ -336,7 +336,7 @@ class Process:
         """
         ended = self.child.reap()
         try:
-            self._take_batch(self.child.left())
+            self._take_batch(self.child.said.batch())
         except _NOT_A_BATCH:
             broken_link = _WROTE
         self.ended = ProcessEnd(ended.status, broken_link or ended.broken_link)
