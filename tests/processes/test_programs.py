@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -92,14 +91,14 @@ def test_a_process_that_starts_when_rsltrace_is_gone_does_not_run() -> None:
         built = build.library(lambda line: None)
     except SetupError as error:
         pytest.skip(str(error))
-    here, there = socket.socketpair()
-    link = f"{there.fileno()}:{1 << 29}:0:0"
+    turns, writer = os.pipe()
+    link = f"{1 << 29}:{turns}:0:0:0"
     libraries = os.pathsep.join(map(str, built.ros.libraries))
     around = {"LD_PRELOAD": str(built.path), "LD_LIBRARY_PATH": libraries, "RSLTRACE_LINK": link}
-    with there:
-        with here:
-            outside = subprocess.run(["/bin/true"], env=around, pass_fds=[there.fileno()])
-        late = subprocess.run(["/bin/true"], env=around, pass_fds=[there.fileno()])
+    outside = subprocess.run(["/bin/true"], env=around, pass_fds=[turns])
+    os.close(writer)
+    late = subprocess.run(["/bin/true"], env=around, pass_fds=[turns])
+    os.close(turns)
     assert (outside.returncode, late.returncode) == (0, 120)
 
 

@@ -1,22 +1,23 @@
-"""A child process and the socket to it: starting, talking, reaping, and leaving none behind."""
+"""A child process and the link to it: starting, talking, reaping, and leaving none behind."""
 
 from __future__ import annotations
 
 import fcntl
 import mmap
 import os
-import socket
+import select
 import struct
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsltrace.adapters.processes.wire import HEAD, RECORD, CommandKind, WireError
+from rsltrace.adapters.processes.wire import RECORD, CommandKind, WireError
 from rsltrace.child_processes import how_ended, kill_group
 from rsltrace.errors import JobError
 from rsltrace.guard.pin import fix_addresses
+from rsltrace.guard.redirect import copy_of
 
 # Memory that a process and the loop both see (``native/shared.h``): files in memory that grow.
 
@@ -38,16 +39,14 @@ class SharedMemory:
         self.size = len(self.data)
 
     def grow(self, size: int) -> None:
-        """Have room for so many bytes."""
-        if size > self.size:
-            os.ftruncate(self.fd, 2 * size)
-            self._look_again()
+        """Have room for twice so many bytes."""
+        os.ftruncate(self.fd, 2 * size)
+        self._look_again()
 
     def has(self, size: int) -> bool:
-        """Return whether there are so many bytes; the process may have made it grow."""
-        if size > self.size:
-            with suppress(OSError, ValueError):
-                self._look_again()
+        """Return whether there are so many bytes, now that the process may have made it grow."""
+        with suppress(OSError, ValueError):
+            self._look_again()
         return size <= self.size
 
     def close(self) -> None:
@@ -57,22 +56,22 @@ class SharedMemory:
         self.fd = -1
 
 
+Batch = tuple[mmap.mmap, int, int]
+"""Whole records that a process has said: the memory, and where in it they begin and end."""
+
+
 class ProcessMessages(SharedMemory):
     """What a process has said and nobody has taken: the length, then whole records."""
 
-    def batch(self, size: int) -> memoryview:
+    def batch(self) -> Batch:
         """Return what is there; it holds until ``taken``.
 
-        :raises WireError: if it is not of this size.
+        :raises WireError: if that is nothing that makes sense.
         """
-        if size != _LENGTH.unpack_from(self.data)[0] or not self.has(_LENGTH.size + size):
+        end = _LENGTH.size + _LENGTH.unpack_from(self.data)[0]
+        if end > self.size and not self.has(end):
             raise WireError("a process has sent what is no batch")
-        return memoryview(self.data)[_LENGTH.size : _LENGTH.size + size]
-
-    def left(self) -> memoryview:
-        """Return what is there of a process that has ended: whole records."""
-        size: int = _LENGTH.unpack_from(self.data)[0]
-        return self.batch(size)
+        return self.data, _LENGTH.size, end
 
     def taken(self) -> None:
         """Make room for the next batch."""
@@ -128,9 +127,9 @@ class Life:
         return states, ticks * _TICK_S
 
 
-_LARGE = 1 << 14
-"""What is longer is not sent, but laid into memory that both see."""
-_HEAD_SIZE = HEAD.size
+_write = copy_of(os.write)  # type: ignore[arg-type]  # these are not what the guard gives nodes
+_epoll = select.epoll
+_TURN = b"\0"
 _LOOK_S = 0.2
 _GRACE_S = 2.0
 _LOST_LINK = 120  # of native/link.cpp
@@ -162,7 +161,7 @@ class ProcessEnd:
 class ProcessHandle:
     """A running executable with the library in it, in a process group of its own.
 
-    ``fixed`` and ``noise``: see ``ProcessProgram``.
+    ``fixed`` and ``noise``: see ``ProcessProgram``. What it has said lies in ``said``.
 
     :raises JobError: if it cannot be started.
     """
@@ -178,33 +177,34 @@ class ProcessHandle:
         noise: int = 0,
     ) -> None:
         self._name = name
-        here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
-        with there:
-            # A reader that looks up now and then sees the end of a child whose own children live.
-            here.setsockopt(
-                socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, int(_LOOK_S * 1e6))
-            )
-            self._said, self._told = ProcessMessages("rsltrace-said"), SharedMemory("rsltrace-told")
-            files = (there.fileno(), self._said.fd, self._told.fd)
-            # Of one length: the environment lies on the stack, and what comes after it moves.
-            numbers = (files[0], os.getpid(), *files[1:], noise)
-            link = ":".join(f"{number:010d}" for number in numbers)
-            try:
-                with nullcontext() if fixed is None else _addresses(fixed):
-                    self._process = subprocess.Popen(
-                        list(argv),
-                        env={**environment, "RSLTRACE_LINK": link},
-                        cwd=folder,
-                        stdin=subprocess.DEVNULL,
-                        pass_fds=files,
-                        start_new_session=True,
-                    )
-            except OSError as error:
-                here.close()
-                self._close_files()
-                raise JobError(f"{name} cannot be started: {error.strerror}: {argv[0]}") from error
-        self._socket = here
-        self._head = memoryview(bytearray(_HEAD_SIZE))
+        self.said, self._told = ProcessMessages("rsltrace-said"), SharedMemory("rsltrace-told")
+        self._link = ExitStack()
+        turns, self._turns = os.pipe()
+        bell = os.eventfd(0, os.EFD_CLOEXEC)
+        epoll = self._link.enter_context(_epoll(2))
+        self._link.callback(os.close, self._turns)
+        self._link.callback(os.close, bell)
+        epoll.register(bell, select.EPOLLIN | select.EPOLLET)  # needs no read
+        epoll.register(self._turns, 0)  # tells when nobody reads any more
+        self._poll, self._rung = epoll.poll, (bell, select.EPOLLIN)
+        files = (turns, bell, self.said.fd, self._told.fd)
+        # Of one length: the environment lies on the stack, and what comes after it moves.
+        link = ":".join(f"{number:010d}" for number in (os.getpid(), *files, noise))
+        try:
+            with nullcontext() if fixed is None else _addresses(fixed):
+                self._process = subprocess.Popen(
+                    list(argv),
+                    env={**environment, "RSLTRACE_LINK": link},
+                    cwd=folder,
+                    stdin=subprocess.DEVNULL,
+                    pass_fds=files,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            self._close_files()
+            raise JobError(f"{name} cannot be started: {error.strerror}: {argv[0]}") from error
+        finally:
+            os.close(turns)
         self._patience = 0
         self._life: Life | None = None
 
@@ -215,56 +215,36 @@ class ProcessHandle:
 
     def send(self, data: bytes) -> None:
         """Send to the process; one that is gone is noticed by ``receive``."""
-        if len(data) > _LARGE:
-            self._told.grow(len(data))
-            self._told.data[: len(data)] = data
-            data = RECORD.pack(len(data), CommandKind.SHARED)
-        with suppress(BrokenPipeError, ConnectionResetError):
-            self._socket.sendall(data)
+        told, size = self._told, len(data)
+        if size > told.size:
+            told.grow(size)
+        told.data[:size] = data
+        try:
+            _write(self._turns, _TURN)
+        except BrokenPipeError:
+            pass
 
-    def receive(self) -> memoryview | None:
+    def receive(self) -> Batch | None:
         """Return the next batch, None if the process has ended; it holds until ``taken``.
 
         :raises WireError: if the process has written something of its own to the link.
         """
-        count = self._read_into(self._head)
-        while 0 < count < _HEAD_SIZE:
-            more = self._read_into(self._head[count:])
-            count = count + more if more else 0
-        return self._said.batch(HEAD.unpack(self._head)[0]) if count else None
-
-    def taken(self) -> None:
-        """Let go of a batch: the process writes the next one to the same place."""
-        self._said.taken()
-
-    def left(self) -> memoryview:
-        """Return what a process has said that has ended, after its last batch.
-
-        :raises WireError: if that is nothing that makes sense.
-        """
-        return self._said.left()
+        looks = 0
+        while True:
+            events = self._poll(_LOOK_S, 2)
+            if self._rung in events:
+                return self.said.batch()
+            # A process may be gone whose children have its end of the link.
+            if events or self._process.poll() is not None:
+                return None
+            looks += self._life is not None and self._life.goes_on()
+            if looks > self._patience:
+                self.kill()
+                return None
 
     def give_up_after(self, seconds: float) -> None:
         """Kill the process if it says nothing for so long, by its own time (``Life``)."""
         self._patience, self._life = int(seconds / _LOOK_S), Life(self.pid)
-
-    def _read_into(self, room: memoryview) -> int:
-        """Read what there is, at least something; 0 if the process has ended."""
-        looks = 0
-        while True:
-            try:
-                return self._socket.recv_into(room)
-            except BlockingIOError:
-                if self._process.poll() is not None:
-                    with suppress(BlockingIOError):  # what it said before
-                        return self._socket.recv_into(room, 0, socket.MSG_DONTWAIT)
-                    return 0
-                looks += self._life is not None and self._life.goes_on()
-                if looks > self._patience:
-                    self.kill()
-                    return 0
-            except ConnectionResetError:
-                return 0
 
     def reap(self) -> ProcessEnd:
         """Wait for the end of a process that says no more; one that lives on is killed."""
@@ -288,7 +268,7 @@ class ProcessHandle:
         """Kill the process with all that it has started."""
         kill_group(self._process.pid)
         self._process.wait()
-        self._socket.close()
+        self._link.close()
 
     def close(self) -> None:
         """Kill the process, and give back what belongs to it."""
@@ -296,7 +276,8 @@ class ProcessHandle:
         self._close_files()
 
     def _close_files(self) -> None:
-        self._said.close()
+        self._link.close()
+        self.said.close()
         self._told.close()
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Protocol
 
 from rsltrace.adapters.processes import graph_answers
-from rsltrace.adapters.processes.child import ProcessEnd, ProcessHandle
+from rsltrace.adapters.processes.child import Batch, ProcessEnd, ProcessHandle
 from rsltrace.adapters.processes.endpoints import (
     ProcessClient,
     ProcessService,
@@ -57,9 +56,10 @@ _SOURCES = (NondeterminismSource.RANDOM, NondeterminismSource.CLOCK, Nondetermin
 """What is drawn, by the numbers of ``native/call_sites.h``."""
 _RECORD_SIZE = RECORD.size
 _PUBLISH, _WAIT = int(RecordKind.PUBLISH), int(RecordKind.WAIT)
-_number = HEAD.unpack_from
+_head, _number = RECORD.unpack_from, HEAD.unpack_from
 _NOT_A_BATCH = (WireError, LookupError, ValueError, TypeError, AttributeError, struct.error)
 """What reading raises if something else than the library has written to the link."""
+_WROTE = "wrote something of its own to"
 
 Question = Callable[[RecordReader], bytes]
 
@@ -247,34 +247,34 @@ class Process:
             try:
                 batch = self.child.receive()
                 answer = b"" if batch is None else self._take_batch(batch)
+                if batch is not None and answer == b"":
+                    raise WireError("a process has sent half a batch")
             except _NOT_A_BATCH:
                 self.child.kill()
-                self._has_ended("wrote something of its own to")
+                self._has_ended(_WROTE)
                 return
             if batch is None:
                 self._has_ended()
                 return
-            self.child.taken()
+            self.child.said.taken()
             if answer is None:
                 return
-            if answer:
-                self.child.send(answer)
+            self.child.send(answer)
 
-    def _take_batch(self, batch: memoryview) -> bytes | None:
+    def _take_batch(self, batch: Batch) -> bytes | None:
         """Do what a batch says; return the answer to the question at its end, None if it waits."""
-        place, end = 0, len(batch)
+        said, place, end = batch
         while place < end:
-            kind, size = RECORD.unpack_from(batch, place)
-            place += _RECORD_SIZE
-            body = batch[place : place + size]
-            place += size
+            kind, size = _head(said, place)
+            begin, place = place + _RECORD_SIZE, place + _RECORD_SIZE + size
             if kind == _PUBLISH:
-                self.things[_number(body)[0]].send(body[4:].tobytes())
+                self.things[_number(said, begin)[0]].send(said[begin + 4 : place])
                 continue
+            body = said[begin:place]
             if kind == _WAIT:
                 if body != self._same_wait or self._held:
                     self._wait(RecordReader(body))
-                    self._same_wait = b"" if self._waking_soon else body.tobytes()
+                    self._same_wait = b"" if self._waking_soon else body
                 return None
             fields = RecordReader(body)
             question = self._questions.get(kind)
@@ -352,8 +352,10 @@ class Process:
         :raises NodeError: if it has failed, and the job does not say to go on.
         """
         ended = self.child.reap()
-        with suppress(*_NOT_A_BATCH):
-            self._take_batch(self.child.left())
+        try:
+            self._take_batch(self.child.said.batch())
+        except _NOT_A_BATCH:
+            broken_link = _WROTE
         self.ended = ProcessEnd(ended.status, broken_link or ended.broken_link)
         self.vanish()
         self.adapter.has_ended(self)

@@ -36,7 +36,7 @@ def stack_text(packed: bytes) -> str:
 
     :raises WireError: if it is none.
     """
-    frames = list(RecordReader(memoryview(packed)).frames())
+    frames = list(RecordReader(packed).frames())
     lines = _lines_of(frames)
     if lines or not frames:
         return "\n".join(lines)

@@ -76,7 +76,6 @@ class CommandKind(IntEnum):
     ANSWER = 2
     STOP = 3
     KILL = 4
-    SHARED = 5
 
 
 class WakeReason(IntEnum):
@@ -98,7 +97,7 @@ class RecordReader:
     :raises WireError: from any of them, if the record is cut off.
     """
 
-    def __init__(self, data: memoryview) -> None:
+    def __init__(self, data: bytes | memoryview) -> None:
         self._data = data
         self._next = 0
 

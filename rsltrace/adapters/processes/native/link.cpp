@@ -9,7 +9,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <sys/prctl.h>
-#include <sys/socket.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
@@ -26,10 +25,10 @@ namespace rsltrace {
 
 namespace {
 
-constexpr std::size_t ROOM = 1 << 16;
 constexpr int FAR = 1000;  // below what select() can take, and most limits
 
-int link_fd = -1;
+int turn_fd = -1;  // a pipe: a byte for each time that the loop has spoken
+int said_fd = -1;  // an eventfd: rung for each batch
 std::int64_t time_ns = 0;
 std::uint64_t seed_of_process = 0;
 bool own_clocks = false;
@@ -37,11 +36,11 @@ bool sleeps_are_instant = false;
 bool keeps_intra_process = false;
 std::uint64_t lets_go = 0;
 std::uint32_t ready_id = 0;
-std::size_t filled = 0;  // bytes of what has been received
 
 // What the process has said and the loop has not taken: its length, then whole records. The loop
 // sets the length to zero, and finds here what a process has said that was killed.
 __constinit Shared said;
+// What the loop has said last.
 __constinit Shared told;
 
 std::atomic<std::uint64_t> &length_said() {
@@ -49,12 +48,6 @@ std::atomic<std::uint64_t> &length_said() {
 }
 
 constexpr std::size_t LENGTH = sizeof(std::uint64_t);
-
-// Not a static object: the link is up before these are made, and goes on when they are gone.
-std::vector<std::uint8_t> &received_there() {
-  static auto *all = new std::vector<std::uint8_t>(ROOM);
-  return *all;
-}
 
 [[noreturn]] void leave(int status) {
   syscall(SYS_exit_group, status);
@@ -65,24 +58,9 @@ std::vector<std::uint8_t> &received_there() {
 [[noreturn]] void lost() { leave(120); }
 
 void send_batch() {
-  const auto size = static_cast<std::uint32_t>(length_said().load());
-  while (true) {
-    const auto sent = syscall(SYS_sendto, link_fd, &size, sizeof size, MSG_NOSIGNAL, nullptr, 0);
-    if (sent == sizeof size) return;
-    if (sent >= 0 || errno != EINTR) lost();
-  }
-}
-
-// Read until `size` bytes are there.
-void receive(std::size_t size) {
-  auto &received = received_there();
-  if (received.size() < size) received.resize(size);
-  while (filled < size) {
-    const auto got = syscall(SYS_recvfrom, link_fd, received.data() + filled,
-                             received.size() - filled, 0, nullptr, nullptr);
-    if (got < 0 && errno == EINTR) continue;
-    if (got <= 0) lost();
-    filled += static_cast<std::size_t>(got);
+  constexpr std::uint64_t once = 1;
+  while (syscall(SYS_write, said_fd, &once, sizeof once) < 0) {
+    if (errno != EINTR) lost();
   }
 }
 
@@ -94,26 +72,29 @@ struct Message {
 
 // Return the next thing that the loop says; it stays readable until the next call.
 Message listen() {
-  filled = 0;  // the loop speaks once for each time it is spoken to
+  char byte;
+  long got;
+  do {
+    got = syscall(SYS_read, turn_fd, &byte, 1);
+  } while (got < 0 && errno == EINTR);
+  if (got != 1) lost();
   std::uint32_t head[2];
-  receive(sizeof head);
-  std::memcpy(head, received_there().data(), sizeof head);
-  const bool is_shared = static_cast<Told>(head[1]) == Told::SHARED;
-  receive(sizeof head + (is_shared ? 0 : head[0]));
+  std::memcpy(head, told.data, sizeof head);
+  if (sizeof head + head[0] > told.size && !told.look_again()) lost();
   const auto kind = static_cast<Told>(head[1]);
   if (kind == Told::KILL) {
     fflush(nullptr);
     leave(0);
   }
-  if (!is_shared) return {kind, received_there().data() + sizeof head, head[0]};
-  if (head[0] > told.size && !told.look_again()) lost();
-  std::memcpy(head, told.data, sizeof head);
-  return {static_cast<Told>(head[1]), told.data + sizeof head, head[0]};
+  return {kind, told.data + sizeof head, head[0]};
 }
 
 void forked() {
-  if (link_fd >= 0) syscall(SYS_close, link_fd);
-  link_fd = -1;
+  if (turn_fd >= 0) {
+    syscall(SYS_close, turn_fd);
+    syscall(SYS_close, said_fd);
+  }
+  turn_fd = said_fd = -1;
   said.forget();
   told.forget();
 }
@@ -147,32 +128,34 @@ int far(int fd) {
   return there;
 }
 
-bool has_no_peer(int fd) {
-  char byte;
-  return syscall(SYS_recvfrom, fd, &byte, 1, MSG_PEEK | MSG_DONTWAIT, nullptr, nullptr) == 0;
+bool has_no_writer(int fd) {
+  pollfd end{fd, 0, 0};
+  const timespec at_once{};
+  return syscall(SYS_ppoll, &end, 1, &at_once, nullptr, 8) == 1 && (end.revents & POLLHUP) != 0;
 }
 
 void begin() {
   const char *link = getenv("RSLTRACE_LINK");
-  int fd = -1;
   int parent = 0;
-  int files[2] = {-1, -1};
+  int files[4] = {-1, -1, -1, -1};
   unsigned noise = 0;
-  if (link == nullptr || sscanf(link, "%d:%d:%d:%d:%u", &fd, &parent, &files[0], &files[1], &noise) < 4) return;
+  if (link == nullptr || sscanf(link, "%d:%d:%d:%d:%d:%u", &parent, &files[0], &files[1], &files[2], &files[3], &noise) < 5) return;
   if (getppid() != parent) {
-    if (has_no_peer(fd)) lost();  // rsltrace was killed before this process got here
+    if (has_no_writer(files[0])) lost();  // rsltrace was killed before this process got here
     return;                       // started by a process of the run: outside of it
   }
   if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
   prctl(PR_SET_PTRACER, PR_SET_PTRACER_ANY);  // gdb may attach where Yama lets only parents do that
-  if (!said.open(far(files[0])) || !told.open(far(files[1]))) leave(120);
-  link_fd = far(fd);
+  if (!said.open(far(files[2])) || !told.open(far(files[3]))) leave(120);
+  turn_fd = far(files[0]);
+  said_fd = far(files[1]);
   signal(SIGINT, SIG_DFL);  // a run in the background of a shell, or under nohup, is no other run
   signal(SIGHUP, SIG_DFL);
   sigset_t none;
   sigemptyset(&none);
   sigprocmask(SIG_SETMASK, &none, nullptr);
-  fcntl(link_fd, F_SETFD, FD_CLOEXEC);  // whatever takes the place of this program cannot be run by it
+  fcntl(turn_fd, F_SETFD, FD_CLOEXEC);  // whatever takes the place of this program cannot be run by it
+  fcntl(said_fd, F_SETFD, FD_CLOEXEC);
   forget_environment();
   pthread_atfork(nullptr, nullptr, forked);
   Writer hello;
@@ -196,7 +179,7 @@ __attribute__((constructor(101))) bool linked() {
     begun = true;
     begin();
   }
-  return link_fd >= 0;
+  return turn_fd >= 0;
 }
 
 std::int64_t now_ns() { return time_ns; }

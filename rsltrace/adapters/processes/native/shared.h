@@ -1,5 +1,5 @@
-// Memory that the loop sees, too. What the process says lies there until the loop has taken it, so
-// that it is not lost with a process that is killed; large things that the loop says lie there, too.
+// Memory that the loop sees, too. What either says lies there until the other has taken it: what a
+// process has said is not lost if it is killed.
 #pragma once
 
 #include <atomic>

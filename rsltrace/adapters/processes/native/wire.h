@@ -11,8 +11,7 @@
 namespace rsltrace {
 
 // From the library to the loop. A batch is records of (kind, length, body) in memory that both see
-// (shared.h), and its length is sent; the last record says what the process wants: to be answered,
-// or to wait.
+// (shared.h); the last record says what the process wants: to be answered, or to wait.
 enum class Say : std::uint32_t {
   HELLO = 1,
   NODE,
@@ -50,9 +49,8 @@ enum class Say : std::uint32_t {
   SENDER,
 };
 
-// From the loop to the library: what comes after (length, kind). What is SHARED is to be read from
-// memory that both see.
-enum class Told : std::uint32_t { GO = 1, ANSWER, STOP, KILL, SHARED };
+// From the loop to the library, in other memory that both see: what comes after (length, kind).
+enum class Told : std::uint32_t { GO = 1, ANSWER, STOP, KILL };
 
 class Writer {
  public:
