@@ -32,7 +32,7 @@ typedef struct {
 
 extern int PyObject_GetBuffer(PyObject *exporter, View *view, int flags);
 extern void PyBuffer_Release(View *view);
-enum { WITH_FORMAT = 4, TO_READ = 0x100 };
+enum { WRITABLE = 1, WITH_FORMAT = 4, TO_READ = 0x100 };
 
 /* The beginning of numpy's PyArrayObject_fields, which its macros make part of its ABI. */
 typedef struct {
@@ -44,9 +44,13 @@ typedef struct {
   int flags;
 } NumpyArray;
 
-enum { C_CONTIGUOUS = 1 };
+/* PyArray_NewFromDescr, and its place in the table of numpy's C functions. */
+typedef PyObject *NewNumpyArray(PyTypeObject *, PyObject *dtype, int, const Py_ssize_t *shape,
+                                const Py_ssize_t *strides, void *data, int, PyObject *);
+enum { C_CONTIGUOUS = 1, NEW_NUMPY_ARRAY = 94 };
 
 static PyTypeObject *array_type, *numpy_array_type;
+static NewNumpyArray *new_numpy_array;
 static PyObject *frombytes;
 
 typedef struct Plan Plan;
@@ -55,7 +59,7 @@ typedef struct {
   Py_ssize_t offset; /* of the slot in a message */
   Py_ssize_t number; /* of items: of an array all, of a sequence the most */
   Py_ssize_t least;  /* bytes of an item, to limit a count before memory is allocated for it */
-  PyObject *made_of; /* arguments for the type of an array or sequence of numbers, or a nested plan */
+  PyObject *made_of; /* dtype of an array of numbers, a sequence of one number, or a nested plan */
   int shape;
   char code; /* of struct, or 's' for a string, 'm' for a message */
   uint8_t size;
@@ -205,7 +209,7 @@ static int write_list(Output *out, const Field *field, PyObject *values) {
 static int write_numpy_array(Output *out, const Field *field, PyObject *value) {
   const NumpyArray *array = (NumpyArray *)value;
   if (Py_TYPE(value) != numpy_array_type || array->dimensions != 1 ||
-      array->dtype != PyTuple_GetItem(field->made_of, 1) || array->shape[0] != field->number ||
+      array->dtype != field->made_of || array->shape[0] != field->number ||
       !(array->flags & C_CONTIGUOUS))
     return -1;
   write_bytes(out, array->data, field->number * field->size, field->size);
@@ -352,39 +356,45 @@ static PyObject *read_list(Input *in, const Field *field) {
   return values;
 }
 
+static PyObject *make_numpy_array(const Field *field) {
+  Py_INCREF(field->made_of); /* for the call to steal */
+  return new_numpy_array(numpy_array_type, field->made_of, 1, &field->number, NULL, NULL, 0, NULL);
+}
+
 static PyObject *read_numpy_array(Input *in, const Field *field) {
   const Py_ssize_t bytes = field->number * field->size;
   const uint8_t *place = take(in, bytes, field->size);
-  PyObject *made;
-  if (place == NULL) return NULL;
-  made = PyObject_CallObject((PyObject *)numpy_array_type, field->made_of);
+  PyObject *made = place == NULL ? NULL : make_numpy_array(field);
   if (made != NULL) memcpy(((NumpyArray *)made)->data, place, bytes);
   return made;
 }
 
+/* A large array is extended by its bytes. Else it is made in its size first, which takes fewer steps
+   but writes it twice. */
+static int fill_array(PyObject *made, const uint8_t *data, Py_ssize_t bytes) {
+  if (bytes < COPIED_ONCE) {
+    View view;
+    int done;
+    if (PyObject_GetBuffer(made, &view, WRITABLE) < 0) return -1;
+    done = view.len == bytes ? 0 : -1;
+    if (done == 0) memcpy(view.buf, data, bytes);
+    PyBuffer_Release(&view);
+    return done;
+  }
+  PyObject *source = PyMemoryView_FromMemory((char *)data, bytes, TO_READ);
+  PyObject *none = source == NULL ? NULL : PyObject_CallMethodObjArgs(made, frombytes, source, NULL);
+  Py_XDECREF(source);
+  Py_XDECREF(none);
+  return none == NULL ? -1 : 0;
+}
+
 static PyObject *read_array(Input *in, const Field *field) {
   const Py_ssize_t count = read_count(in, field->size), bytes = count * field->size;
-  const uint8_t *place;
-  PyObject *made, *data, *done;
-  if (count < 0) return NULL;
-  if (count == 0) return PyObject_CallObject((PyObject *)array_type, field->made_of);
-  place = take(in, bytes, field->size);
-  if (place == NULL) return NULL;
-  if (count < COPIED_ONCE / field->size) {
-    data = PyBytes_FromStringAndSize((const char *)place, bytes);
-    if (data == NULL) return NULL;
-    made = PyObject_CallFunctionObjArgs((PyObject *)array_type,
-                                        PyTuple_GetItem(field->made_of, 0), data, NULL);
-    Py_DECREF(data);
-    return made;
-  }
-  made = PyObject_CallObject((PyObject *)array_type, field->made_of);
-  if (made == NULL) return NULL;
-  data = PyMemoryView_FromMemory((char *)place, bytes, TO_READ);
-  done = data == NULL ? NULL : PyObject_CallMethodObjArgs(made, frombytes, data, NULL);
-  Py_XDECREF(data);
-  if (done == NULL) Py_CLEAR(made);
-  Py_XDECREF(done);
+  const uint8_t *place = count <= 0 ? NULL : take(in, bytes, field->size);
+  PyObject *made;
+  if (count < 0 || (count > 0 && place == NULL)) return NULL;
+  made = PySequence_Repeat(field->made_of, bytes < COPIED_ONCE ? count : 0);
+  if (made != NULL && count > 0 && fill_array(made, place, bytes) < 0) Py_CLEAR(made);
   return made;
 }
 
@@ -447,19 +457,43 @@ static Py_ssize_t slot_offset(const Plan *plan, PyObject *name) {
   return offset;
 }
 
-static PyTypeObject *imported(const char *module, const char *name) {
+static PyObject *imported(const char *module, const char *name) {
   PyObject *from = PyImport_ImportModule(module);
   PyObject *found = from == NULL ? NULL : PyObject_GetAttrString(from, name);
   Py_XDECREF(from);
-  return (PyTypeObject *)found;
+  return found;
 }
 
 /* At the first plan: not all who import this module need numpy. */
 static int find_types(void) {
-  if (array_type == NULL) array_type = imported("array", "array");
-  if (numpy_array_type == NULL) numpy_array_type = imported("numpy", "ndarray");
-  if (frombytes == NULL) frombytes = PyUnicode_InternFromString("frombytes");
-  return array_type == NULL || numpy_array_type == NULL || frombytes == NULL ? -1 : 0;
+  PyObject *table;
+  if (new_numpy_array != NULL) return 0;
+  array_type = (PyTypeObject *)imported("array", "array");
+  numpy_array_type = (PyTypeObject *)imported("numpy", "ndarray");
+  frombytes = PyUnicode_InternFromString("frombytes");
+  if (array_type == NULL || numpy_array_type == NULL || frombytes == NULL) return -1;
+  table = imported("numpy._core._multiarray_umath", "_ARRAY_API");
+  if (table == NULL) { /* numpy 1 */
+    PyErr_Clear();
+    table = imported("numpy.core._multiarray_umath", "_ARRAY_API");
+  }
+  if (table != NULL) {
+    void **functions = PyCapsule_GetPointer(table, NULL);
+    if (functions != NULL) new_numpy_array = (NewNumpyArray *)functions[NEW_NUMPY_ARRAY];
+    Py_DECREF(table);
+  }
+  return new_numpy_array == NULL ? -1 : 0;
+}
+
+static int is_as_numpy_makes_it(const Field *field) {
+  PyObject *made = make_numpy_array(field);
+  const NumpyArray *array = (NumpyArray *)made;
+  const int as_declared = made != NULL && Py_TYPE(made) == numpy_array_type &&
+                          array->dimensions == 1 && array->shape[0] == field->number &&
+                          array->strides[0] == field->size && array->dtype == field->made_of &&
+                          (array->flags & C_CONTIGUOUS);
+  Py_XDECREF(made);
+  return as_declared;
 }
 
 static PyTypeObject *plan_type;
@@ -479,9 +513,10 @@ static int read_field(Plan *plan, Field *field, PyObject *described) {
       field->number <= PY_SSIZE_T_MAX / 8 && strchr("?cbBhHiIqQfdsm", code) != NULL &&
       (code != 'm' || Py_TYPE(made_of) == plan_type) &&
       (field->shape == SINGLE || !holds_numbers(field) ||
-       (PyTuple_Check(made_of) && PyTuple_Size(made_of) == (field->shape == ARRAY ? 2 : 1))))
+       (field->shape == ARRAY ? is_as_numpy_makes_it(field) : Py_TYPE(made_of) == array_type)))
     return 0;
-  PyErr_Format(PyExc_ValueError, "no such field: %R", described);
+  if (PyErr_Occurred()) return -1;
+  PyErr_Format(PyExc_TypeError, "no such field: %R", described);
   return -1;
 }
 

@@ -8,6 +8,7 @@ has built ``rsltrace/_cdr.c``, which needs no generated functions.
 
 from __future__ import annotations
 
+import array
 import sys
 from collections.abc import Callable
 from functools import cache, cached_property, partial
@@ -93,7 +94,7 @@ def compiled_plan(message_class: type) -> Any:
     careful = partial(encode, spec), partial(decode, spec)
     try:
         return core.MessagePlan(spec.cls, spec.check_fields, tuple(fields), *careful)
-    except TypeError:
+    except (TypeError, ImportError):
         return None  # the class has not the slots of rosidl's
 
 
@@ -113,9 +114,10 @@ def _planned(field: FieldSpec) -> tuple[Any, ...] | None:
     made_of: Any = None
     if isinstance(item, PrimitiveType):
         code, size = item.code, item.size
-        made_of = (number, item.dtype) if shape == _ARRAY and item.typecode else (item.typecode,)
         if item.name == "char":
             return None
+        if item.typecode:
+            made_of = item.dtype if shape == _ARRAY else array.array(item.typecode, [0])
     elif isinstance(item, StringType):
         code, size = "s", 4
         if item.wide:
