@@ -1,7 +1,7 @@
 /* Messages to canonical CDR and back, compiled: what encoder_source.py and decoder_source.py generate
    for usual messages, with the same bytes and values. All that is unusual (a wrong type, a number out
-   of range, bytes of the other order) goes to the Python functions of checked_codec.py, which also
-   raise the errors: so here a failure needs no reason.
+   of range, bytes of the other order) goes to those functions, which also raise the errors: so here a
+   failure needs no reason.
 
    No Python code runs between the first look at a message and its last byte, so that nothing changes
    under our feet. Messages do not nest in themselves: recursion is as deep as their definitions. */

@@ -3,7 +3,7 @@
 rclpy's serializer leaves padding uninitialised, so that equal messages give different bytes. These
 codecs give the bytes of rclpy, with zeros as padding and nothing after the last field, so that
 bytes can be hashed and compared. They are also several times as fast, and more so where a compiler
-has built ``rsltrace/_cdr.c``, which needs no generated functions.
+has built ``rsltrace/_cdr.c``: then the generated functions are for what is unusual.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ from __future__ import annotations
 import array
 import sys
 from collections.abc import Callable
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from typing import Any
 
-from rsltrace.adapters.rclpy.messages.checked_codec import decode, encode
 from rsltrace.adapters.rclpy.messages.decoder_source import make_deserializer
 from rsltrace.adapters.rclpy.messages.encoder_source import make_serializer
 from rsltrace.adapters.rclpy.messages.message_spec import (
@@ -54,7 +53,7 @@ class Codec:
         Raises TypeError or ValueError naming the field, if rclpy cannot serialize it either.
         """
         plan = compiled_plan(self._spec.cls)
-        return make_serializer(self._spec) if plan is None else plan.serialize
+        return _serializer(self._spec.cls) if plan is None else plan.serialize
 
     @cached_property
     def deserialize(self) -> Callable[[bytes], Any]:
@@ -64,7 +63,7 @@ class Codec:
         CDR. As in rclpy, invalid UTF-8 is replaced, and bounds are not checked.
         """
         plan = compiled_plan(self._spec.cls)
-        return make_deserializer(self._spec) if plan is None else plan.deserialize
+        return _deserializer(self._spec.cls) if plan is None else plan.deserialize
 
     @cached_property
     def canonical(self) -> Callable[[bytes], bytes]:
@@ -91,11 +90,26 @@ def compiled_plan(message_class: type) -> Any:
     fields = [_planned(field) for field in spec.fields]
     if None in fields:
         return None
-    careful = partial(encode, spec), partial(decode, spec)
     try:
-        return core.MessagePlan(spec.cls, spec.check_fields, tuple(fields), *careful)
-    except (TypeError, ImportError):
-        return None  # the class has not the slots of rosidl's
+        return core.MessagePlan(
+            spec.cls,
+            spec.check_fields,
+            tuple(fields),
+            lambda message: _serializer(message_class)(message),  # made when it is needed
+            lambda raw: _deserializer(message_class)(raw),
+        )
+    except (AttributeError, ImportError, TypeError):
+        return None  # the class has not the slots of rosidl's, or the arrays are not numpy's
+
+
+@cache
+def _serializer(message_class: type) -> Callable[[Any], bytes]:
+    return make_serializer(message_spec(message_class))
+
+
+@cache
+def _deserializer(message_class: type) -> Callable[[bytes], Any]:
+    return make_deserializer(message_spec(message_class))
 
 
 _SINGLE, _ARRAY, _SEQUENCE = range(3)
