@@ -1,6 +1,6 @@
 """What a build adds to the sources: its version, and the compiled module where a compiler is.
 
-python hatch_build.py    builds the module into this checkout, if its source is newer
+python hatch_build.py    builds the module into this checkout, if a source is newer
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ except ModuleNotFoundError:  # run as a program
 
 _TEXT = '"""The version of this build."""\n\n__version__ = {version!r}\n'
 _MODULE = "rsltrace/_core.abi3.so"
-_SOURCE = Path(__file__).resolve().parent / "rsltrace" / "_core.c"
+_FOLDER = Path(__file__).resolve().parent / "rsltrace"
+_SOURCES = sorted(_FOLDER.glob("_*.c"))
 _OPTIONS = ("-std=c11", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-Wall", "-Wextra")
 
 
@@ -38,7 +39,7 @@ class BuildOfRsltrace(BuildHookInterface):  # type: ignore[misc, valid-type]
         self._folder = TemporaryDirectory()
         folder = Path(self._folder.name)
         if version == "editable":
-            self._say(compile_core(_SOURCE.parent / Path(_MODULE).name))
+            self._say(compile_core(_FOLDER / Path(_MODULE).name))
             return
         made = folder / "_version.py"
         made.write_text(_TEXT.format(version=self.metadata.version), encoding="utf-8")
@@ -70,7 +71,7 @@ def compile_core(made: Path) -> str:
     compiler = shlex.split(os.environ.get("CC", "")) or ["cc"]
     unfinished = made.with_name(f"{made.name}.{os.getpid()}")
     include = f"-I{sysconfig.get_path('include')}"
-    command = [*compiler, *_OPTIONS, include, str(_SOURCE), "-o", str(unfinished)]
+    command = [*compiler, *_OPTIONS, include, *map(str, _SOURCES), "-o", str(unfinished)]
     try:
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
@@ -85,8 +86,9 @@ def compile_core(made: Path) -> str:
 
 def main() -> None:
     """Build in place what is out of date."""
-    made = _SOURCE.parent / Path(_MODULE).name
-    if not made.exists() or made.stat().st_mtime < _SOURCE.stat().st_mtime:
+    made = _FOLDER / Path(_MODULE).name
+    newest = max(source.stat().st_mtime for source in _SOURCES)
+    if not made.exists() or made.stat().st_mtime < newest:
         problem = compile_core(made)
         if problem:
             print(f"rsltrace without its compiled module: {problem}")

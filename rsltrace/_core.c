@@ -602,6 +602,8 @@ static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT, "_core", NULL, -1, NULL, NULL, NULL, NULL, NULL,
 };
 
+int add_message_plan(PyObject *module); /* of _cdr.c */
+
 PyMODINIT_FUNC PyInit__core(void) {
   PyObject *chain_type, *module = PyModule_Create(&definition);
   if (module == NULL) return NULL;
@@ -611,7 +613,8 @@ PyMODINIT_FUNC PyInit__core(void) {
   no_sequence = PyLong_FromUnsignedLong(U32);
   if (draw_kind == NULL || no_sequence == NULL || buffer_type == NULL || chain_type == NULL ||
       PyModule_AddObjectRef(module, "RecordBuffer", (PyObject *)buffer_type) < 0 ||
-      PyModule_AddObjectRef(module, "EventChain", chain_type) < 0) {
+      PyModule_AddObjectRef(module, "EventChain", chain_type) < 0 ||
+      add_message_plan(module) < 0) {
     Py_XDECREF(chain_type);
     Py_DECREF(module);
     return NULL;

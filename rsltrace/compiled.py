@@ -13,11 +13,9 @@ from types import ModuleType
 
 def _is_older_than_its_source(module: ModuleType) -> bool:
     """Return whether a checkout has got another source since it was built."""
-    try:
-        source_s = os.stat(os.path.join(os.path.dirname(__file__), "_core.c")).st_mtime
-    except OSError:
-        return False  # an installed package has no source
-    return os.stat(str(module.__file__)).st_mtime < source_s
+    built_s = os.stat(str(module.__file__)).st_mtime
+    with os.scandir(os.path.dirname(__file__)) as files:  # an installed package has no sources
+        return any(file.stat().st_mtime > built_s for file in files if file.name.endswith(".c"))
 
 
 core: ModuleType | None = None

@@ -66,13 +66,20 @@ def check_contents(wheel: Path, sdist: Path) -> str:
     is_compiled = "rsltrace/_core.abi3.so" in names
     assert is_compiled != wheel.name.endswith("-py3-none-any.whl"), wheel.name
     code = {path.relative_to(ROOT) for path in (ROOT / "rsltrace").rglob("*") if path.is_file()}
-    code -= {Path("rsltrace/_core.c"), Path("rsltrace/_core.abi3.so")}
+    sources = {path for path in code if path.suffix == ".c"}
+    code -= {*sources, Path("rsltrace/_core.abi3.so")}
     missing = {str(p) for p in code if "__pycache__" not in p.parts} - set(names)
     assert not missing, f"not in the wheel: {sorted(missing)}"
     assert sum(".data/data/share/man/man1/" in name for name in names) > 10, "no manual pages"
     with tarfile.open(sdist) as archive:
         inside = {name.partition("/")[2] for name in archive.getnames()}
-    wanted = {"tests/packaging/check_dist.py", "docs/install.md", "package.xml", "man/rsltrace.1"}
+    wanted = {
+        *map(str, sources),
+        "tests/packaging/check_dist.py",
+        "docs/install.md",
+        "package.xml",
+        "man/rsltrace.1",
+    }
     assert wanted <= inside, f"not in the sdist: {sorted(wanted - inside)}"
     return version
 
