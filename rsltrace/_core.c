@@ -848,7 +848,7 @@ static PyMethodDef dispatcher_methods[] = {
 static int append_to(PyObject *queue, PyObject *item) {
   if ((PyObject *)Py_TYPE(queue) == deque_type)
     return done(PyObject_CallFunctionObjArgs(deque_append, queue, item, NULL));
-  return done(PyObject_CallMethod(queue, "append", "O", item));
+  return done(PyObject_CallMethod(queue, "append", "(O)", item));
 }
 
 /* Whether a queue has as many items as it keeps. */

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import subprocess
 import sys
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +45,10 @@ class Breaking(EventObserver):
         return 7
 
 
+class OtherQueue(deque[Any]):
+    """As a wait set puts in place of a queue."""
+
+
 class Run:
     """A publisher with subscriptions that keep one message, three, and all."""
 
@@ -72,6 +77,7 @@ class Run:
                 replace(DEFAULT_QOS, history=History.KEEP_ALL),
             )
         ]
+        self.subscriptions[2].queue = OtherQueue()
         for subscription in self.subscriptions:
             self.publisher.connect(subscription)
 
