@@ -100,7 +100,7 @@ class Run:
             elif self.compiled:
                 self.dispatcher.end_event()
             else:
-                PythonEventEnd.end_event(self.dispatcher)  # type: ignore[arg-type]
+                PythonEventEnd.end_event(self.dispatcher)
         except RuntimeError as error:
             outcome = str(error)
         if rng.random() < 0.1:
