@@ -1,6 +1,7 @@
 /* The hot part of a recorded run, compiled: what trace/recorder.py's EventChain and trace/writer.py's
-   RecordBuffer do, with the same bytes. What is unusual (a number that does not fit, an index of
-   numpy) is left to Python's struct. */
+   RecordBuffer do, the end of an event and the way of a message into queues, with the same bytes.
+   What is unusual (a number that does not fit, an index of numpy, a link, a watched topic) is left
+   to Python. */
 
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030A0000
@@ -418,12 +419,16 @@ static int put(uint8_t *row, PyObject *value, uint64_t most, size_t size) {
   return number <= most;
 }
 
-static PyObject *layout(const char *name) {
-  PyObject *format = PyImport_ImportModule("rsltrace.trace.format"), *found;
-  if (format == NULL) return NULL;
-  found = PyObject_GetAttrString(format, name);
-  Py_DECREF(format);
+static PyObject *attribute_of(const char *module_name, const char *name) {
+  PyObject *module = PyImport_ImportModule(module_name), *found;
+  if (module == NULL) return NULL;
+  found = PyObject_GetAttrString(module, name);
+  Py_DECREF(module);
   return found;
+}
+
+static PyObject *layout(const char *name) {
+  return attribute_of("rsltrace.trace.format", name);
 }
 
 static int copy_packed(uint8_t *row, PyObject *packed, Py_ssize_t size) {
@@ -598,6 +603,416 @@ static PyType_Spec chain_spec = {
     Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, chain_slots,
 };
 
+/* -- fields ------------------------------------------------------------------------------------- */
+
+/* Base classes of Python's: what is read below lies in a struct, where Python reads and writes it
+   like a slot. A field is NULL until it is set. They have object's __new__, the only one that lets
+   Python 3.11 keep the other attributes without a dict. */
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *now_ns, *events, *activity_ns, *ready;
+} Loop;
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *entity, *node, *kind, *cause_event, *cause_output, *input_hash, *flags, *quiet;
+} Event;
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *loop, *event, *entities, *recorder, *unrecorded, *pending, *after;
+} Dispatcher;
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *active, *state, *queue, *keep; /* not every entity has the last three */
+  PyObject *dispatcher, *entity_id; /* from here on what a publisher has */
+  PyObject *subscriptions, *links, *observers, *count, *channel, *history, *offers;
+} Entity;
+
+static PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type, *chain_type;
+static PyObject *deque_type, *deque_append, *hash64, *zero, *output_kind;
+
+#define FIELD_COUNT(Struct) ((sizeof(Struct) - sizeof(PyObject)) / sizeof(PyObject *))
+
+#define FIELDS(Struct, prefix)                                                       \
+  static int prefix##_traverse(PyObject *self, visitproc visit, void *arg) {         \
+    Py_VISIT(Py_TYPE(self));                                                         \
+    for (size_t i = 0; i < FIELD_COUNT(Struct); ++i)                                 \
+      Py_VISIT(((PyObject **)(self + 1))[i]);                                        \
+    return 0;                                                                        \
+  }                                                                                  \
+  static int prefix##_clear(PyObject *self) {                                        \
+    for (size_t i = 0; i < FIELD_COUNT(Struct); ++i)                                 \
+      Py_CLEAR(((PyObject **)(self + 1))[i]);                                        \
+    return 0;                                                                        \
+  }                                                                                  \
+  static void prefix##_dealloc(PyObject *self) {                                     \
+    PyTypeObject *type = Py_TYPE(self);                                              \
+    PyObject_GC_UnTrack(self);                                                       \
+    prefix##_clear(self);                                                            \
+    PyObject_GC_Del(self);                                                           \
+    Py_DECREF(type);                                                                 \
+  }                                                                                  \
+  static PyTypeObject *prefix##_made(PyMemberDef *fields,  PyMethodDef *methods) {   \
+    PyType_Slot slots[] = {                                                          \
+        {Py_tp_dealloc, prefix##_dealloc}, {Py_tp_traverse, prefix##_traverse},      \
+        {Py_tp_clear, prefix##_clear},     {Py_tp_members, fields},                  \
+        {Py_tp_methods, methods},          {0, NULL},                                \
+    };                                                                               \
+    PyType_Spec spec = {                                                             \
+        "rsltrace._core." #Struct "Fields", sizeof(Struct), 0,                       \
+        Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, slots,        \
+    };                                                                               \
+    return (PyTypeObject *)PyType_FromSpec(&spec);                                   \
+  }
+
+FIELDS(Loop, loop)
+FIELDS(Event, event)
+FIELDS(Dispatcher, dispatcher)
+FIELDS(Entity, entity)
+
+#define FIELD(Struct, field, name) {name, T_OBJECT_EX, offsetof(Struct, field), 0, NULL}
+#define NO_FIELD {NULL, 0, 0, 0, NULL}
+
+static PyMemberDef loop_fields[] = {
+    FIELD(Loop, now_ns, "now_ns"), FIELD(Loop, events, "events"),
+    FIELD(Loop, activity_ns, "activity_ns"), FIELD(Loop, ready, "ready"), NO_FIELD,
+};
+
+static PyMemberDef event_fields[] = {
+    FIELD(Event, entity, "entity"),
+    FIELD(Event, node, "node"),
+    FIELD(Event, kind, "kind"),
+    FIELD(Event, cause_event, "cause_event"),
+    FIELD(Event, cause_output, "cause_output"),
+    FIELD(Event, input_hash, "input_hash"),
+    FIELD(Event, flags, "flags"),
+    FIELD(Event, quiet, "quiet"),
+    NO_FIELD,
+};
+
+static PyMemberDef dispatcher_fields[] = {
+    FIELD(Dispatcher, loop, "loop"),
+    FIELD(Dispatcher, event, "event"),
+    FIELD(Dispatcher, entities, "entities"),
+    FIELD(Dispatcher, recorder, "recorder"),
+    FIELD(Dispatcher, unrecorded, "unrecorded"),
+    FIELD(Dispatcher, pending, "_pending"),
+    FIELD(Dispatcher, after, "_after"),
+    NO_FIELD,
+};
+
+static PyMemberDef entity_fields[] = {
+    FIELD(Entity, active, "active"),
+    FIELD(Entity, state, "state"),
+    FIELD(Entity, queue, "queue"),
+    FIELD(Entity, keep, "keep"),
+    FIELD(Entity, dispatcher, "dispatcher"),
+    FIELD(Entity, entity_id, "entity_id"),
+    FIELD(Entity, subscriptions, "subscriptions"),
+    FIELD(Entity, links, "links"),
+    FIELD(Entity, observers, "observers"),
+    FIELD(Entity, count, "_count"),
+    FIELD(Entity, channel, "_channel"),
+    FIELD(Entity, history, "_history"),
+    FIELD(Entity, offers, "_offers"),
+    NO_FIELD,
+};
+
+/* Whether an object has the fields of a struct, all set from ``first`` on; else sets an error. */
+static int has_fields(PyObject *object, PyTypeObject *type, const PyMemberDef *fields, size_t first,
+                      size_t count) {
+  if (object == NULL || !PyObject_TypeCheck(object, type)) {
+    PyErr_SetString(PyExc_TypeError, "a part of the run is missing, or of another class");
+    return 0;
+  }
+  for (size_t i = first; i < count; ++i)
+    if (((PyObject **)(object + 1))[i] == NULL) {
+      PyErr_SetString(PyExc_AttributeError, fields[i].name);
+      return 0;
+    }
+  return 1;
+}
+
+#define HAS_FIELDS(object, Struct, prefix) \
+  has_fields((PyObject *)(object), prefix##_type, prefix##_fields, 0, FIELD_COUNT(Struct))
+
+static int is_publisher(PyObject *object) {
+  const size_t first = (offsetof(Entity, dispatcher) - sizeof(PyObject)) / sizeof(PyObject *);
+  return has_fields(object, entity_type, entity_fields, first, FIELD_COUNT(Entity));
+}
+
+/* Replaces a field by a new object, or fails if there is none. */
+static int set(PyObject **field, PyObject *value) {
+  PyObject *old = *field;
+  if (value == NULL) return -1;
+  *field = value;
+  Py_XDECREF(old);
+  return 0;
+}
+
+static int add_one(PyObject **field) {
+  const unsigned long long value = PyLong_AsUnsignedLongLong(*field);
+  if (value == (unsigned long long)-1 && PyErr_Occurred()) return -1;
+  return set(field, PyLong_FromUnsignedLongLong(value + 1));
+}
+
+static int done(PyObject *result) {
+  Py_XDECREF(result);
+  return result == NULL ? -1 : 0;
+}
+
+static int call_method(PyObject *object, const char *name) {
+  return done(PyObject_CallMethod(object, name, NULL));
+}
+
+/* -- Dispatcher --------------------------------------------------------------------------------- */
+
+static PyObject *state_hash_of(PyObject *node) {
+  PyObject *state, *hash;
+  if (node == Py_None) return Py_NewRef(zero);
+  if (PyObject_TypeCheck(node, entity_type) && ((Entity *)node)->state != NULL)
+    state = Py_NewRef(((Entity *)node)->state);
+  else
+    state = PyObject_GetAttrString(node, "state");
+  if (state == NULL) return NULL;
+  hash = state == Py_None ? Py_NewRef(zero) : PyObject_CallMethod(state, "after_event", NULL);
+  Py_DECREF(state);
+  return hash;
+}
+
+static int record_end(Dispatcher *self, Loop *loop, Event *event, PyObject *state_hash) {
+  PyObject *recorder = self->recorder, *result;
+  PyObject *row[] = {loop->now_ns,       event->kind,         event->flags,      event->entity,
+                     event->cause_event, event->cause_output, event->input_hash, state_hash};
+  if (recorder == Py_None) return set(&self->unrecorded, Py_NewRef(zero));
+  Py_INCREF(recorder);
+  for (int i = 0; i < 8; ++i) Py_INCREF(row[i]);
+  if (PyObject_TypeCheck(recorder, chain_type))
+    result = chain_end_event((Chain *)recorder, row, 8);
+  else
+    result = PyObject_CallMethod(recorder, "end_event", "OOOOOOOO", row[0], row[1], row[2], row[3],
+                                 row[4], row[5], row[6], row[7]);
+  for (int i = 0; i < 8; ++i) Py_DECREF(row[i]);
+  Py_DECREF(recorder);
+  return done(result);
+}
+
+static int settle_entities(Dispatcher *self) {
+  const Py_ssize_t pending = PyObject_Length(self->pending);
+  if (pending <= 0) return (int)pending;
+  return done(PyObject_CallMethod(self->entities, "settle", "O", self->recorder));
+}
+
+static int tell_observers(Dispatcher *self) {
+  PyObject *observers = Py_NewRef(self->after);
+  const Py_ssize_t count = PyTuple_Size(observers);
+  int failed = count < 0;
+  for (Py_ssize_t i = 0; i < count && !failed; ++i)
+    failed = call_method(PyTuple_GetItem(observers, i), "after_event") < 0;
+  Py_DECREF(observers);
+  return failed ? -1 : 0;
+}
+
+static PyObject *dispatcher_end_event(Dispatcher *self, PyObject *Py_UNUSED(none)) {
+  PyObject *node, *state_hash = NULL, *result = NULL;
+  Event *event;
+  Loop *loop;
+  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || settle_entities(self) < 0) return NULL;
+  event = (Event *)Py_NewRef(self->event);
+  loop = (Loop *)Py_NewRef(self->loop);
+  if (HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop)) {
+    node = Py_NewRef(event->node);
+    state_hash = state_hash_of(node);
+    Py_DECREF(node);
+  }
+  if (state_hash != NULL && record_end(self, loop, event, state_hash) == 0 &&
+      add_one(&loop->events) == 0 && set(&event->flags, Py_NewRef(zero)) == 0 &&
+      set(&event->quiet, Py_NewRef(Py_False)) == 0 && tell_observers(self) == 0)
+    result = Py_NewRef(Py_None);
+  Py_XDECREF(state_hash);
+  Py_DECREF(loop);
+  Py_DECREF(event);
+  return result;
+}
+
+static PyMethodDef dispatcher_methods[] = {
+    {"end_event", (PyCFunction)dispatcher_end_event, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+/* -- Publisher ---------------------------------------------------------------------------------- */
+
+static int append_to(PyObject *queue, PyObject *item) {
+  if ((PyObject *)Py_TYPE(queue) == deque_type)
+    return done(PyObject_CallFunctionObjArgs(deque_append, queue, item, NULL));
+  return done(PyObject_CallMethod(queue, "append", "(O)", item));
+}
+
+/* Whether a queue has as many items as it keeps. */
+static int is_full(PyObject *queue, PyObject *keep) {
+  Py_ssize_t count, most;
+  if (keep == Py_None) return 0;
+  count = PyObject_Length(queue);
+  most = PyLong_AsSsize_t(keep);
+  return count < 0 || (most == -1 && PyErr_Occurred()) ? -1 : count == most;
+}
+
+static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
+  Entity *to = (Entity *)subscription;
+  int is_it;
+  if (!PyObject_TypeCheck(subscription, entity_type) || to->queue == NULL || to->keep == NULL ||
+      to->active == NULL) {
+    PyErr_SetString(PyExc_TypeError, "a subscription has no queue");
+    return -1;
+  }
+  is_it = is_full(to->queue, to->keep);
+  if (is_it < 0 || (is_it && call_method(subscription, "drop") < 0)) return -1;
+  if (append_to(to->queue, delivery) < 0) return -1;
+  is_it = PyObject_IsTrue(to->active);
+  if (is_it <= 0) return is_it < 0 ? -1 : call_method(subscription, "awaken");
+  return append_to(loop->ready, subscription);
+}
+
+static int deliver_to_all(Entity *self, PyObject *delivery, Loop *loop) {
+  PyObject *all = Py_NewRef(self->subscriptions);
+  int failed = 0;
+  for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
+    PyObject *subscription = Py_NewRef(PyList_GetItem(all, i));
+    failed = deliver(subscription, delivery, loop);
+    Py_DECREF(subscription);
+  }
+  Py_DECREF(all);
+  return failed;
+}
+
+/* Records a message; returns its digest and its position in the event. */
+static int record_message(Entity *self, PyObject *recorder, Loop *loop, PyObject *data,
+                          PyObject *content_hash, PyObject **digest, PyObject **position) {
+  PyObject *kind, *row[6];
+  *digest = content_hash != Py_None ? Py_NewRef(content_hash)
+                                    : PyObject_CallFunctionObjArgs(hash64, data, NULL);
+  kind = *digest == NULL ? NULL : PyObject_GetAttr((PyObject *)self, output_kind);
+  if (kind == NULL) return -1;
+  row[0] = kind;
+  row[1] = Py_NewRef(self->entity_id);
+  row[2] = Py_NewRef(self->channel);
+  row[3] = Py_NewRef(loop->now_ns);
+  row[4] = data, row[5] = *digest;
+  *position = chain_message((Chain *)recorder, row, 6);
+  for (int i = 0; i < 4; ++i) Py_DECREF(row[i]);
+  return *position == NULL ? -1 : 0;
+}
+
+static PyObject *delivery_of(Loop *loop, PyObject *data, PyObject *digest, PyObject *position,
+                             PyObject *count) {
+  PyObject *now_ns = loop->now_ns;
+  PyObject *items[] = {now_ns,   zero,   zero,   Py_None, data, loop->events,
+                       position, digest, now_ns, count};
+  PyObject *delivery = PyTuple_New(10);
+  for (int i = 0; delivery != NULL && i < 10; ++i)
+    PyTuple_SetItem(delivery, i, Py_NewRef(items[i]));
+  return delivery;
+}
+
+static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
+                        PyObject *content_hash) {
+  PyObject *digest = NULL, *position = NULL, *delivery = NULL;
+  PyObject *recorder = Py_NewRef(dispatcher->recorder);
+  Loop *loop = (Loop *)Py_NewRef(dispatcher->loop);
+  int failed = !HAS_FIELDS(loop, Loop, loop) || add_one(&self->count) < 0;
+  if (!failed && recorder != Py_None) {
+    failed = record_message(self, recorder, loop, data, content_hash, &digest, &position);
+  } else if (!failed) {
+    failed = add_one(&dispatcher->unrecorded);
+    digest = Py_NewRef(zero);
+    position = Py_NewRef(zero);
+  }
+  if (!failed) {
+    delivery = delivery_of(loop, data, digest, position, self->count);
+    failed = delivery == NULL || set(&loop->activity_ns, Py_NewRef(loop->now_ns)) < 0 ||
+             deliver_to_all(self, delivery, loop) < 0;
+  }
+  Py_XDECREF(delivery);
+  Py_XDECREF(position);
+  Py_XDECREF(digest);
+  Py_DECREF(loop);
+  Py_DECREF(recorder);
+  return failed ? -1 : 0;
+}
+
+static PyObject *publisher_send(Entity *self, PyObject *const *args, Py_ssize_t count) {
+  PyObject *content_hash, *recorder;
+  Dispatcher *dispatcher;
+  int failed;
+  if (check_count("send", count, 1, 2) < 0 || !is_publisher((PyObject *)self))
+    return NULL;
+  dispatcher = (Dispatcher *)self->dispatcher;
+  if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) return NULL;
+  content_hash = count > 1 ? args[1] : Py_None;
+  recorder = dispatcher->recorder;
+  if (self->observers != Py_None || self->links != Py_None || self->history != Py_None ||
+      self->offers != Py_None || !PyList_Check(self->subscriptions) ||
+      (recorder != Py_None &&
+       (self->channel == Py_None || !PyObject_TypeCheck(recorder, chain_type))))
+    return PyObject_CallMethod((PyObject *)self, "send_any", "OO", args[0], content_hash);
+  Py_INCREF(dispatcher);
+  failed = send_plainly(self, dispatcher, args[0], content_hash);
+  Py_DECREF(dispatcher);
+  return failed ? NULL : Py_NewRef(Py_None);
+}
+
+static PyMethodDef publisher_methods[] = {
+    {"send", (PyCFunction)(void (*)(void))publisher_send, METH_FASTCALL, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyMethodDef no_methods[] = {{NULL, NULL, 0, NULL}};
+
+/* The fields of an entity, and the method of a publisher. */
+static PyObject *publisher_made(void) {
+  PyType_Slot slots[] = {{Py_tp_methods, publisher_methods}, {0, NULL}};
+  PyType_Spec spec = {
+      "rsltrace._core.PublisherFields", sizeof(Entity), 0,
+      Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, slots,
+  };
+  return PyType_FromSpecWithBases(&spec, (PyObject *)entity_type);
+}
+
+static int add_types(PyObject *module) {
+  deque_type = attribute_of("collections", "deque");
+  deque_append = deque_type == NULL ? NULL : PyObject_GetAttrString(deque_type, "append");
+  hash64 = attribute_of("xxhash", "xxh3_64_intdigest");
+  zero = PyLong_FromLong(0);
+  output_kind = PyUnicode_InternFromString("output_kind");
+  draw_kind = PyLong_FromLong(DRAW);
+  no_sequence = PyLong_FromUnsignedLong(U32);
+  buffer_type = (PyTypeObject *)PyType_FromSpec(&buffer_spec);
+  chain_type = (PyTypeObject *)PyType_FromSpec(&chain_spec);
+  loop_type = loop_made(loop_fields, no_methods);
+  event_type = event_made(event_fields, no_methods);
+  dispatcher_type = dispatcher_made(dispatcher_fields, dispatcher_methods);
+  entity_type = entity_made(entity_fields, no_methods);
+  const struct {
+    const char *name;
+    PyObject *object;
+  } all[] = {
+      {"RecordBuffer", (PyObject *)buffer_type},   {"EventChain", (PyObject *)chain_type},
+      {"LoopFields", (PyObject *)loop_type},       {"EventFields", (PyObject *)event_type},
+      {"EventEnd", (PyObject *)dispatcher_type},   {"EntityFields", (PyObject *)entity_type},
+      {"PublisherFields", entity_type == NULL ? NULL : publisher_made()},
+  };
+  if (deque_append == NULL || hash64 == NULL || zero == NULL || output_kind == NULL ||
+      draw_kind == NULL || no_sequence == NULL)
+    return -1;
+  for (size_t i = 0; i < sizeof all / sizeof *all; ++i)
+    if (all[i].object == NULL || PyModule_AddObjectRef(module, all[i].name, all[i].object) < 0)
+      return -1;
+  return 0;
+}
+
 static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT, "_core", NULL, -1, NULL, NULL, NULL, NULL, NULL,
 };
@@ -605,20 +1020,7 @@ static struct PyModuleDef definition = {
 int add_message_plan(PyObject *module); /* of _cdr.c */
 
 PyMODINIT_FUNC PyInit__core(void) {
-  PyObject *chain_type, *module = PyModule_Create(&definition);
-  if (module == NULL) return NULL;
-  buffer_type = (PyTypeObject *)PyType_FromSpec(&buffer_spec);
-  chain_type = PyType_FromSpec(&chain_spec);
-  draw_kind = PyLong_FromLong(DRAW);
-  no_sequence = PyLong_FromUnsignedLong(U32);
-  if (draw_kind == NULL || no_sequence == NULL || buffer_type == NULL || chain_type == NULL ||
-      PyModule_AddObjectRef(module, "RecordBuffer", (PyObject *)buffer_type) < 0 ||
-      PyModule_AddObjectRef(module, "EventChain", chain_type) < 0 ||
-      add_message_plan(module) < 0) {
-    Py_XDECREF(chain_type);
-    Py_DECREF(module);
-    return NULL;
-  }
-  Py_DECREF(chain_type);
+  PyObject *module = PyModule_Create(&definition);
+  if (module != NULL && (add_types(module) < 0 || add_message_plan(module) < 0)) Py_CLEAR(module);
   return module;
 }

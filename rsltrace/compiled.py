@@ -1,7 +1,8 @@
 """The compiled module ``rsltrace._core``, built where a compiler is (``hatch_build.py``).
 
 It replaces the hottest classes by equal ones: same bytes, same errors. ``RSLTRACE_COMPILED=0`` in
-the environment switches it off.
+the environment switches it off. Others get a base class from it, whose struct holds the attributes
+that compiled code reads; such an attribute must not be one of a class, too.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import os
 from importlib import import_module
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 
 def _is_older_than_its_source(module: ModuleType) -> bool:
@@ -27,3 +29,11 @@ if os.environ.get("RSLTRACE_COMPILED") != "0":
             core = None
     except ImportError:
         pass  # not built
+
+LoopFields = object
+EventFields = object
+EntityFields = object
+PublisherFields = object
+if core is not None and not TYPE_CHECKING:
+    LoopFields, EventFields = core.LoopFields, core.EventFields
+    EntityFields, PublisherFields = core.EntityFields, core.PublisherFields

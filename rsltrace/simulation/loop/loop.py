@@ -20,6 +20,7 @@ from collections.abc import Callable
 from heapq import heappop, heappush
 from typing import Any, Protocol
 
+from rsltrace.compiled import LoopFields
 from rsltrace.errors import LivelockError
 from rsltrace.simulation.loop.stop import Progress, Stop, StopCondition, quiet_until_ns
 from rsltrace.simulation.loop.timer_queue import NEVER_NS, TimerQueue, TimerState
@@ -52,7 +53,7 @@ def _act(release: Release) -> None:
     release[4]()
 
 
-class EventLoop:
+class EventLoop(LoopFields):
     """The state of a simulation in time: clock, ready queue, timers, scheduled releases.
 
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
+from rsltrace.compiled import EntityFields
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import callback_source
 from rsltrace.trace.model.entity import Entity, EntityKind
@@ -55,7 +56,7 @@ class GraphMembership(Protocol):
         """Return the servers of a service in creation order."""
 
 
-class DomainEntity:
+class DomainEntity(EntityFields):
     """Something with an id in the trace: a participant, an endpoint, a timer.
 
     It is ``active`` while its participant is run; only then does the loop learn of its arrivals.
@@ -167,10 +168,14 @@ class Receiver(DomainEntity):
     """
 
     queue: deque[Any]
-    keep: int | None = None
+    keep: int | None
     """How many arrivals the queue holds; a full one drops its oldest. None: all."""
     origin = slice(1, 4)
     """Where an arrival says what it is: publishing event, which of its outputs, content hash."""
+
+    def __init__(self, dispatcher: Dispatcher, node: Any) -> None:
+        super().__init__(dispatcher, node)
+        self.keep = None
 
     def deliver(self, arrival: Any) -> None:
         """Queue an arrival; it is dispatched once its participant runs."""

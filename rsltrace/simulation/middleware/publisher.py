@@ -5,8 +5,9 @@ from __future__ import annotations
 from bisect import insort
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rsltrace.compiled import PublisherFields, core
 from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, TopicFaults
@@ -67,7 +68,7 @@ class Transport:
         return channel
 
 
-class Publisher(DomainEntity):
+class Publisher(DomainEntity, PublisherFields):
     """Sends a topic.
 
     ``subscriptions`` are the connected ones in creation order; ``links`` lead to them in a job with
@@ -103,7 +104,7 @@ class Publisher(DomainEntity):
     def type_name(self) -> str:
         return self.type.name
 
-    def send(self, data: bytes, content_hash: int | None = None) -> None:
+    def send_any(self, data: bytes, content_hash: int | None = None) -> None:
         """Send canonical CDR bytes; ``content_hash`` if not all of them are content."""
         observers = self.observers
         if observers is not None and observers.filter is not None:
@@ -157,6 +158,11 @@ class Publisher(DomainEntity):
         if observers is not None:
             for watch in observers.watchers:
                 watch(self, data)
+
+    if core is None or TYPE_CHECKING:
+        send = send_any
+        """The compiled one does the usual case, without links and watchers, and leaves the others
+        to ``send_any``."""
 
     def _content_hash(self, data: bytes) -> int:
         return hash64(log_content(data) if self.output_kind == OutputKind.LOG else data)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
+from rsltrace.compiled import core
 from rsltrace.errors import OutputError
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.middleware.events.event import (
@@ -88,7 +89,55 @@ class EntityRegistry:
                 (self.pending if owned else self.unowned).append(one)
 
 
-class Dispatcher:
+class PythonEventEnd:
+    """How an event ends. The compiled module has an equal class."""
+
+    loop: EventLoop
+    event: CurrentEvent
+    entities: EntityRegistry
+    recorder: Recorder | None
+    unrecorded: int
+    _pending: list[Recordable]
+    _after: tuple[EventObserver, ...]
+
+    def end_event(self) -> None:
+        """Record the current event, possibly a later part of the one ``execute`` began."""
+        if self._pending:
+            self.entities.settle(self.recorder)
+        event = self.event
+        loop = self.loop
+        recorder = self.recorder
+        node = event.node
+        state_hash = 0
+        if node is not None and node.state is not None:
+            state_hash = node.state.after_event()
+        if recorder is None:
+            self.unrecorded = 0
+        else:
+            recorder.end_event(
+                loop.now_ns,
+                event.kind,
+                event.flags,
+                event.entity,
+                event.cause_event,
+                event.cause_output,
+                event.input_hash,
+                state_hash,
+            )
+        loop.events += 1
+        event.flags = 0
+        event.quiet = False
+        if self._after:
+            for observer in self._after:
+                observer.after_event()
+
+
+EventEnd = PythonEventEnd
+if core is not None and not TYPE_CHECKING:
+    EventEnd = core.EventEnd
+
+
+class Dispatcher(EventEnd):
     """Runs the callbacks of a run, one event at a time, and records the results.
 
     ``recorder`` is None in an unrecorded run; ``unrecorded`` then counts the outputs of the event.
@@ -198,37 +247,6 @@ class Dispatcher:
             self.exception_handler if node is None else node.exception_handler
         )
         exception_handler.raised(error, handle)
-
-    def end_event(self) -> None:
-        """Record the current event, possibly a later part of the one ``execute`` began."""
-        if self._pending:
-            self.entities.settle(self.recorder)
-        event = self.event
-        loop = self.loop
-        recorder = self.recorder
-        node = event.node
-        state_hash = 0
-        if node is not None and node.state is not None:
-            state_hash = node.state.after_event()
-        if recorder is None:
-            self.unrecorded = 0
-        else:
-            recorder.end_event(
-                loop.now_ns,
-                event.kind,
-                event.flags,
-                event.entity,
-                event.cause_event,
-                event.cause_output,
-                event.input_hash,
-                state_hash,
-            )
-        loop.events += 1
-        event.flags = 0
-        event.quiet = False
-        if self._after:
-            for observer in self._after:
-                observer.after_event()
 
     def run_outside(
         self,

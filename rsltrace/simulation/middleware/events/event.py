@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
+from rsltrace.compiled import EventFields
 from rsltrace.errors import RunError
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.recorded_order import THE_RUN, entity_text
@@ -128,8 +129,7 @@ class EventOwner(Protocol):
     exception_handler: ExceptionHandler
 
 
-@dataclass(eq=False, slots=True)
-class CurrentEvent:
+class CurrentEvent(EventFields):
     """The current event: one object that each event fills in anew.
 
     What it sends leaves ``busy_ns`` later (execution times), and its executor is busy for
@@ -137,18 +137,19 @@ class CurrentEvent:
     after it. ``node`` is an ``EventOwner`` or None.
     """
 
-    handle: Dispatchable | None = None
-    entity: int = 0
-    node: Any = None
-    kind: int = 0
-    cause_event: int = NO_EVENT
-    cause_output: int = 0
-    input_hash: int = 0
-    flags: int = 0
-    quiet: bool = False
-    on_end: Callable[[], None] | None = None
-    busy_ns: int = 0
-    took_ns: int = 0
+    def __init__(self) -> None:
+        self.handle: Dispatchable | None = None
+        self.entity = 0
+        self.node: Any = None
+        self.kind = 0
+        self.cause_event = NO_EVENT
+        self.cause_output = 0
+        self.input_hash = 0
+        self.flags = 0
+        self.quiet = False
+        self.on_end: Callable[[], None] | None = None
+        self.busy_ns = 0
+        self.took_ns = 0
 
 
 class OutsideEvent:
