@@ -11,6 +11,11 @@
 #include <string.h>
 #include <structmember.h>
 
+/* Headers from 3.12 on do not count this reference: it would be lost in older versions, for which the
+   module is built, too. */
+#undef Py_RETURN_NONE
+#define Py_RETURN_NONE return Py_NewRef(Py_None)
+
 #if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "rows are packed as they lie in memory"
 #endif
@@ -103,6 +108,11 @@ typedef struct {
 static PyTypeObject *buffer_type;
 static PyObject *draw_kind, *no_sequence;
 
+/* "y#" would do, but not for an older version than that of the headers. */
+static PyObject *bytes_of(const uint8_t *data, Py_ssize_t size) {
+  return PyBytes_FromStringAndSize((const char *)data, size);
+}
+
 static int called(PyObject *function) {
   PyObject *result = PyObject_CallObject(function, NULL);
   Py_XDECREF(result);
@@ -181,7 +191,7 @@ static void buffer_dealloc(Buffer *self) {
 static PyObject *add_payload(Buffer *self, PyObject *channel, PyObject *stamp, PyObject *data) {
   PyObject *sequence, *next, *parts[4];
   Py_ssize_t size;
-  const Py_ssize_t place = PyLong_AsSsize_t(channel);
+  const Py_ssize_t place = PyNumber_AsSsize_t(channel, PyExc_IndexError);
   if (place == -1 && PyErr_Occurred()) return NULL;
   sequence = PyList_GetItem(self->sequences, place);
   if (sequence == NULL) return NULL;
@@ -452,7 +462,7 @@ static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, Py
   if (self->buffer != NULL) {
     if (append(&self->buffer->contents, row, CONTENT) < 0) return -1;
   } else {
-    PyObject *result = PyObject_CallFunction(self->add_output, "y#", row, (Py_ssize_t)CONTENT);
+    PyObject *result = PyObject_CallFunction(self->add_output, "N", bytes_of(row, CONTENT));
     if (result == NULL) return -1;
     Py_DECREF(result);
   }
@@ -556,7 +566,7 @@ static PyObject *chain_end_event(Chain *self, PyObject *const *args, Py_ssize_t 
   if (self->buffer != NULL) {
     if (add_event(self->buffer, row, self->chain_hash) < 0) return NULL;
   } else {
-    PyObject *result = PyObject_CallFunction(self->add_event, "y#K", row, (Py_ssize_t)REST,
+    PyObject *result = PyObject_CallFunction(self->add_event, "NK", bytes_of(row, REST),
                                              self->chain_hash);
     if (result == NULL) return NULL;
     Py_DECREF(result);
@@ -783,8 +793,9 @@ static PyObject *state_hash_of(PyObject *node) {
   return hash;
 }
 
-static int record_end(Dispatcher *self, Loop *loop, Event *event, PyObject *state_hash) {
-  PyObject *recorder = self->recorder, *result;
+static int record_end(Dispatcher *self, PyObject *recorder, Loop *loop, Event *event,
+                      PyObject *state_hash) {
+  PyObject *result;
   PyObject *row[] = {loop->now_ns,       event->kind,         event->flags,      event->entity,
                      event->cause_event, event->cause_output, event->input_hash, state_hash};
   if (recorder == Py_None) return set(&self->unrecorded, Py_NewRef(zero));
@@ -807,6 +818,7 @@ static int settle_entities(Dispatcher *self) {
 }
 
 static int tell_observers(Dispatcher *self) {
+  if (!HAS_FIELDS(self, Dispatcher, dispatcher)) return -1;
   PyObject *observers = Py_NewRef(self->after);
   const Py_ssize_t count = PyTuple_Size(observers);
   int failed = count < 0;
@@ -817,22 +829,28 @@ static int tell_observers(Dispatcher *self) {
 }
 
 static PyObject *dispatcher_end_event(Dispatcher *self, PyObject *Py_UNUSED(none)) {
-  PyObject *node, *state_hash = NULL, *result = NULL;
+  PyObject *node, *recorder, *state_hash = NULL, *result = NULL;
   Event *event;
   Loop *loop;
-  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || settle_entities(self) < 0) return NULL;
+  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || settle_entities(self) < 0 ||
+      !HAS_FIELDS(self, Dispatcher, dispatcher))
+    return NULL;
   event = (Event *)Py_NewRef(self->event);
   loop = (Loop *)Py_NewRef(self->loop);
+  recorder = Py_NewRef(self->recorder);
   if (HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop)) {
     node = Py_NewRef(event->node);
     state_hash = state_hash_of(node);
     Py_DECREF(node);
   }
-  if (state_hash != NULL && record_end(self, loop, event, state_hash) == 0 &&
+  if (state_hash != NULL && HAS_FIELDS(self, Dispatcher, dispatcher) &&
+      HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop) &&
+      record_end(self, recorder, loop, event, state_hash) == 0 && HAS_FIELDS(loop, Loop, loop) &&
       add_one(&loop->events) == 0 && set(&event->flags, Py_NewRef(zero)) == 0 &&
       set(&event->quiet, Py_NewRef(Py_False)) == 0 && tell_observers(self) == 0)
     result = Py_NewRef(Py_None);
   Py_XDECREF(state_hash);
+  Py_DECREF(recorder);
   Py_DECREF(loop);
   Py_DECREF(event);
   return result;
@@ -868,9 +886,17 @@ static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
     PyErr_SetString(PyExc_TypeError, "a subscription has no queue");
     return -1;
   }
-  is_it = is_full(to->queue, to->keep);
-  if (is_it < 0 || (is_it && call_method(subscription, "drop") < 0)) return -1;
-  if (append_to(to->queue, delivery) < 0) return -1;
+  PyObject *queue = Py_NewRef(to->queue), *keep = Py_NewRef(to->keep);
+  is_it = is_full(queue, keep);
+  const int failed = is_it < 0 || (is_it && call_method(subscription, "drop") < 0) ||
+                     append_to(queue, delivery) < 0 || !HAS_FIELDS(loop, Loop, loop);
+  Py_DECREF(keep);
+  Py_DECREF(queue);
+  if (failed) return -1;
+  if (to->active == NULL) {
+    PyErr_SetString(PyExc_TypeError, "a subscription has lost its fields");
+    return -1;
+  }
   is_it = PyObject_IsTrue(to->active);
   if (is_it <= 0) return is_it < 0 ? -1 : call_method(subscription, "awaken");
   return append_to(loop->ready, subscription);
@@ -889,7 +915,7 @@ static int deliver_to_all(Entity *self, PyObject *delivery, Loop *loop) {
 }
 
 /* Records a message; returns its digest and its position in the event. */
-static int record_message(Entity *self, PyObject *recorder, Loop *loop, PyObject *data,
+static int record_message(Entity *self, PyObject *recorder, PyObject *now_ns, PyObject *data,
                           PyObject *content_hash, PyObject **digest, PyObject **position) {
   PyObject *kind, *row[6];
   *digest = content_hash != Py_None ? Py_NewRef(content_hash)
@@ -899,16 +925,15 @@ static int record_message(Entity *self, PyObject *recorder, Loop *loop, PyObject
   row[0] = kind;
   row[1] = Py_NewRef(self->entity_id);
   row[2] = Py_NewRef(self->channel);
-  row[3] = Py_NewRef(loop->now_ns);
+  row[3] = Py_NewRef(now_ns);
   row[4] = data, row[5] = *digest;
   *position = chain_message((Chain *)recorder, row, 6);
   for (int i = 0; i < 4; ++i) Py_DECREF(row[i]);
   return *position == NULL ? -1 : 0;
 }
 
-static PyObject *delivery_of(Loop *loop, PyObject *data, PyObject *digest, PyObject *position,
-                             PyObject *count) {
-  PyObject *now_ns = loop->now_ns;
+static PyObject *delivery_of(Loop *loop, PyObject *now_ns, PyObject *data, PyObject *digest,
+                             PyObject *position, PyObject *count) {
   PyObject *items[] = {now_ns,   zero,   zero,   Py_None, data, loop->events,
                        position, digest, now_ns, count};
   PyObject *delivery = PyTuple_New(10);
@@ -919,22 +944,26 @@ static PyObject *delivery_of(Loop *loop, PyObject *data, PyObject *digest, PyObj
 
 static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
                         PyObject *content_hash) {
-  PyObject *digest = NULL, *position = NULL, *delivery = NULL;
+  PyObject *digest = NULL, *position = NULL, *delivery = NULL, *now_ns = NULL;
   PyObject *recorder = Py_NewRef(dispatcher->recorder);
   Loop *loop = (Loop *)Py_NewRef(dispatcher->loop);
-  int failed = !HAS_FIELDS(loop, Loop, loop) || add_one(&self->count) < 0;
+  int failed = !HAS_FIELDS(loop, Loop, loop);
+  if (!failed) now_ns = Py_NewRef(loop->now_ns);
+  failed = failed || add_one(&self->count) < 0;
   if (!failed && recorder != Py_None) {
-    failed = record_message(self, recorder, loop, data, content_hash, &digest, &position);
+    failed = record_message(self, recorder, now_ns, data, content_hash, &digest, &position) < 0 ||
+             !HAS_FIELDS(loop, Loop, loop) || !is_publisher((PyObject *)self);
   } else if (!failed) {
     failed = add_one(&dispatcher->unrecorded);
     digest = Py_NewRef(zero);
     position = Py_NewRef(zero);
   }
   if (!failed) {
-    delivery = delivery_of(loop, data, digest, position, self->count);
-    failed = delivery == NULL || set(&loop->activity_ns, Py_NewRef(loop->now_ns)) < 0 ||
+    delivery = delivery_of(loop, now_ns, data, digest, position, self->count);
+    failed = delivery == NULL || set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 ||
              deliver_to_all(self, delivery, loop) < 0;
   }
+  Py_XDECREF(now_ns);
   Py_XDECREF(delivery);
   Py_XDECREF(position);
   Py_XDECREF(digest);

@@ -27,8 +27,8 @@ if os.environ.get("RSLTRACE_COMPILED") != "0":
         core = import_module("rsltrace._core")
         if _is_older_than_its_source(core):
             core = None
-    except ImportError:
-        pass  # not built
+    except (ImportError, OSError):
+        core = None  # not built
 
 LoopFields = object
 EventFields = object

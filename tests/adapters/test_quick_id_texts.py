@@ -39,6 +39,8 @@ def test_other_arrays_and_other_options_are_left_to_numpy(
 
 def test_a_run_makes_them_quickly_and_puts_numpys_own_back(simulate: object) -> None:
     arrayprint = pytest.importorskip("numpy._core.arrayprint")
+    if not hasattr(arrayprint, "format_options"):
+        pytest.skip("numpy 2.0 makes them itself")
     keywords = arrayprint._default_array_str.keywords
     before = keywords["array2string"]
     during = []

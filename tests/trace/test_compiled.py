@@ -210,3 +210,50 @@ def test_a_module_older_than_its_source_is_not_used(tmp_path: Path) -> None:
     assert not compiled._is_older_than_its_source(module)
     os.utime(built, (0, 0))
     assert compiled._is_older_than_its_source(module)
+
+
+def _other_pythons() -> list[Path]:
+    """Return interpreters of other versions that have headers, those of pyenv among them."""
+    root = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
+    places = [*root.glob("versions/3.*/bin/python"), *Path("/usr/bin").glob("python3.1?")]
+    asks = "import sys, sysconfig; print(*sys.version_info[:2], sysconfig.get_path('include'))"
+    found = {}
+    for place in sorted(places):
+        said = subprocess.run([place, "-c", asks], capture_output=True, text=True).stdout.split()
+        if said and (Path(said[-1]) / "Python.h").exists() and int(said[1]) >= 10:
+            found[int(said[1])] = place
+    return [place for minor, place in found.items() if minor != sys.version_info[1]]
+
+
+_MAKES = """
+import pathlib, sys
+import hatch_build
+sys.exit(hatch_build.compile_core(pathlib.Path(sys.argv[1])) or 0)
+"""
+_IN_PLACE_OF_OURS = """
+import importlib.util, sys
+import pytest
+spec = importlib.util.spec_from_file_location("rsltrace._core", sys.argv[1])
+sys.modules["rsltrace._core"] = module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+from rsltrace import compiled
+assert compiled.core is module
+for _ in range(50_000):
+    module.RecordBuffer(*[None] * 2, *[1] * 4).clear_rows()
+sys.exit(pytest.main(["-q", "-p", "no:cacheprovider", "-k", "same", *sys.argv[2:]]))
+"""
+
+
+@pytest.mark.long
+@needs_core
+def test_what_headers_of_another_version_make_works_here(tmp_path: Path) -> None:
+    """One wheel serves all versions: what their headers inline must fit them all."""
+    others = _other_pythons()
+    if not others:
+        pytest.skip("there is no other Python with headers")
+    for number, other in enumerate(others):
+        made = tmp_path / f"{number}.abi3.so"
+        subprocess.run([other, "-c", _MAKES, made], cwd=ROOT, check=True)
+        command = [sys.executable, "-c", _IN_PLACE_OF_OURS, made, __file__]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, f"{other}: {done.stdout[-2000:]}{done.stderr[-2000:]}"

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rsltrace.adapters.processes.wire import RECORD, CommandKind, WireError
 from rsltrace.child_processes import how_ended, kill_group
@@ -128,7 +129,7 @@ class Life:
 
 
 _write = copy_of(os.write)  # type: ignore[arg-type]  # these are not what the guard gives nodes
-_epoll = select.epoll
+_epoll: Any = getattr(select, "epoll", None)  # Linux has it, and only there are processes run
 _TURN = b"\0"
 _LOOK_S = 0.2
 _GRACE_S = 2.0

@@ -26,6 +26,7 @@ PUBLISH_TIME_BYTES = 8
 _CHUNK_HEAD = struct.Struct("<BQQQQII")
 """Opcode, length, first and last log time, size and CRC unpacked, length of the compression."""
 
+_APART_BYTES_MIN = 64 << 10
 _HEAD_BYTES_MAX = 512
 """What is read of a chunk for its fields before the data: longer ones name no known compression."""
 
@@ -54,8 +55,9 @@ def read_chunk(
     """
     if span.length < _CHUNK_HEAD.size:
         raise DamageError(f"its length is given as {span.length}")
-    # Of a file, the data is read apart: it need not be copied out of its record.
-    first = span.length if source.is_remote else min(span.length, _HEAD_BYTES_MAX)
+    # Much data of a file is read apart: it need not be copied out of its record.
+    apart = span.length >= _APART_BYTES_MIN and not source.is_remote
+    first = _HEAD_BYTES_MAX if apart else span.length
     record = source.read_at(span.offset, first)
     opcode, length, _, _, size, crc, text = _CHUNK_HEAD.unpack_from(record)
     if opcode != Opcode.CHUNK or length + _HEAD_BYTES != span.length:
