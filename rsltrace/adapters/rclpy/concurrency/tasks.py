@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable
 from types import FunctionType, MethodType
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from rsltrace.adapters.rclpy.concurrency.coroutines import CoroutineTask, TaskRun
 from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox
@@ -14,13 +15,19 @@ from rsltrace.trace.model.event import EventKind, OutputKind
 
 _TASK = int(EventKind.TASK)
 
+_is_coroutine: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
+
 
 def is_coroutine_function(callback: object) -> bool:
-    """Return whether calling ``callback`` gives a coroutine, as ``inspect`` does, which is slow."""
+    """Return whether calling ``callback`` gives a coroutine; cached: ``inspect`` is slow, and audit
+    hooks are told of who looks at a function's code."""
     function = callback.__func__ if type(callback) is MethodType else callback
-    if type(function) is not FunctionType or function.__dict__:  # maybe marked as one
+    if type(function) is not FunctionType:
         return inspect.iscoroutinefunction(callback)
-    return bool(function.__code__.co_flags & inspect.CO_COROUTINE)
+    known = _is_coroutine.get(function)
+    if known is None:
+        known = _is_coroutine[function] = inspect.iscoroutinefunction(callback)
+    return known
 
 
 def is_awaited(runtime: Runtime, callback: object) -> bool:
