@@ -378,8 +378,10 @@ class Process:
         self.child.give_up_after(_GRACE_S)
         if self.has_begun:  # an event that the run does not have any more
             recorder, self.dispatcher.recorder = self.dispatcher.recorder, None
-            self._converse()
-            self.dispatcher.recorder = recorder
+            try:
+                self._converse()
+            finally:
+                self.dispatcher.recorder = recorder
             if self.ended is not None:
                 return
         self.child.send(RECORD.pack(0, CommandKind.STOP))
