@@ -1,7 +1,7 @@
 /* The hot part of a recorded run, compiled: what trace/recorder.py's EventChain and trace/writer.py's
-   RecordBuffer do, the end of an event and the way of a message into queues, with the same bytes.
-   What is unusual (a number that does not fit, an index of numpy, a link, a watched topic) is left
-   to Python. */
+   RecordBuffer do, an event, and the way of a message from its publisher to a callback, with the
+   same bytes. What is unusual (a number that does not fit, an index of numpy, a link, a watched
+   topic, a coroutine, a busy callback group) is left to Python. */
 
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030A0000
@@ -26,6 +26,7 @@ enum {
   CONTENT = 16,     /* format.OUTPUT_CONTENT */
   CONTENT_KIND = 12,
   DRAW = 11,        /* OutputKind.DRAW */
+  SUBSCRIPTION = 3, /* EventKind.SUBSCRIPTION */
 };
 
 #define U8 0xFFu
@@ -626,23 +627,35 @@ typedef struct {
 
 typedef struct {
   PyObject_HEAD
-  PyObject *entity, *node, *kind, *cause_event, *cause_output, *input_hash, *flags, *quiet;
+  PyObject *handle, *entity, *node, *kind, *cause_event, *cause_output, *input_hash;
+  PyObject *flags, *quiet, *on_end;
 } Event;
 
 typedef struct {
   PyObject_HEAD
-  PyObject *loop, *event, *entities, *recorder, *unrecorded, *pending, *after;
+  PyObject *loop, *event, *entities, *recorder, *unrecorded, *pending, *before, *after;
 } Dispatcher;
 
 typedef struct {
   PyObject_HEAD
-  PyObject *active, *state, *queue, *keep; /* not every entity has the last three */
+  /* Not every entity has all of these. */
+  PyObject *active, *state, *queue, *keep;
+  PyObject *node, *destroyed, *wrapper, *own_group, *mailbox;
+  PyObject *callback, *coroutine, *with_info, *deserialize, *serialize, *sites;
   PyObject *dispatcher, *entity_id; /* from here on what a publisher has */
   PyObject *subscriptions, *links, *observers, *count, *channel, *history, *offers;
 } Entity;
 
-static PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type, *chain_type;
-static PyObject *deque_type, *deque_append, *hash64, *zero, *output_kind;
+typedef struct {
+  PyObject_HEAD
+  PyObject *due, *running;
+} Sites;
+
+static PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type, *sites_type, *chain_type;
+static PyObject *deque_type, *deque_append, *deque_popleft, *hash64, *zero, *output_kind, *call_back;
+static PyObject *loop_seen, *event_seen, *dispatcher_seen, *sites_seen; /* subclasses: see is_a */
+static PyObject *publisher_seen, *subscription_seen, *node_seen, *chain_seen;
+static PyObject *callback_group, *active_entity, *user_callback, *raw;
 
 #define FIELD_COUNT(Struct) ((sizeof(Struct) - sizeof(PyObject)) / sizeof(PyObject *))
 
@@ -682,6 +695,7 @@ FIELDS(Loop, loop)
 FIELDS(Event, event)
 FIELDS(Dispatcher, dispatcher)
 FIELDS(Entity, entity)
+FIELDS(Sites, sites)
 
 #define FIELD(Struct, field, name) {name, T_OBJECT_EX, offsetof(Struct, field), 0, NULL}
 #define NO_FIELD {NULL, 0, 0, 0, NULL}
@@ -692,6 +706,7 @@ static PyMemberDef loop_fields[] = {
 };
 
 static PyMemberDef event_fields[] = {
+    FIELD(Event, handle, "handle"),
     FIELD(Event, entity, "entity"),
     FIELD(Event, node, "node"),
     FIELD(Event, kind, "kind"),
@@ -700,7 +715,12 @@ static PyMemberDef event_fields[] = {
     FIELD(Event, input_hash, "input_hash"),
     FIELD(Event, flags, "flags"),
     FIELD(Event, quiet, "quiet"),
+    FIELD(Event, on_end, "on_end"),
     NO_FIELD,
+};
+
+static PyMemberDef sites_fields[] = {
+    FIELD(Sites, due, "due"), FIELD(Sites, running, "running"), NO_FIELD,
 };
 
 static PyMemberDef dispatcher_fields[] = {
@@ -710,6 +730,7 @@ static PyMemberDef dispatcher_fields[] = {
     FIELD(Dispatcher, recorder, "recorder"),
     FIELD(Dispatcher, unrecorded, "unrecorded"),
     FIELD(Dispatcher, pending, "_pending"),
+    FIELD(Dispatcher, before, "_before"),
     FIELD(Dispatcher, after, "_after"),
     NO_FIELD,
 };
@@ -719,6 +740,17 @@ static PyMemberDef entity_fields[] = {
     FIELD(Entity, state, "state"),
     FIELD(Entity, queue, "queue"),
     FIELD(Entity, keep, "keep"),
+    FIELD(Entity, node, "node"),
+    FIELD(Entity, destroyed, "destroyed"),
+    FIELD(Entity, wrapper, "wrapper"),
+    FIELD(Entity, own_group, "own_group"),
+    FIELD(Entity, mailbox, "mailbox"),
+    FIELD(Entity, callback, "_callback"),
+    FIELD(Entity, coroutine, "_coroutine"),
+    FIELD(Entity, with_info, "_with_info"),
+    FIELD(Entity, deserialize, "_deserialize"),
+    FIELD(Entity, serialize, "_serialize"),
+    FIELD(Entity, sites, "_sites"),
     FIELD(Entity, dispatcher, "dispatcher"),
     FIELD(Entity, entity_id, "entity_id"),
     FIELD(Entity, subscriptions, "subscriptions"),
@@ -731,27 +763,46 @@ static PyMemberDef entity_fields[] = {
     NO_FIELD,
 };
 
-/* Whether an object has the fields of a struct, all set from ``first`` on; else sets an error. */
-static int has_fields(PyObject *object, PyTypeObject *type, const PyMemberDef *fields, size_t first,
-                      size_t count) {
-  if (object == NULL || !PyObject_TypeCheck(object, type)) {
-    PyErr_SetString(PyExc_TypeError, "a part of the run is missing, or of another class");
-    return 0;
-  }
-  for (size_t i = first; i < count; ++i)
-    if (((PyObject **)(object + 1))[i] == NULL) {
-      PyErr_SetString(PyExc_AttributeError, fields[i].name);
-      return 0;
-    }
+/* Whether an object is of a class of ours. ``seen`` is the last of its subclasses that was found to
+   be one: to look for a base class takes long. */
+static inline int is_a(PyObject *object, PyTypeObject *type, PyObject **seen) {
+  PyObject *own = (PyObject *)Py_TYPE(object), *old = *seen;
+  if (own == old) return 1;
+  if (!PyType_IsSubtype((PyTypeObject *)own, type)) return 0;
+  *seen = Py_NewRef(own);
+  Py_XDECREF(old);
   return 1;
 }
 
+static void refuse(PyObject *object, PyTypeObject *type, const PyMemberDef *fields, size_t first) {
+  if (object == NULL || !PyObject_TypeCheck(object, type)) {
+    PyErr_SetString(PyExc_TypeError, "a part of the run is missing, or of another class");
+    return;
+  }
+  while (((PyObject **)(object + 1))[first] != NULL) ++first;
+  PyErr_SetString(PyExc_AttributeError, fields[first].name);
+}
+
+/* Whether an object has the fields of a struct, all set from ``first`` on; else sets an error. It is
+   asked more often than anything else: let the compiler write it out. */
+static inline __attribute__((always_inline)) int has_fields(
+    PyObject *object, PyTypeObject *type, PyObject **seen, const PyMemberDef *fields,
+    size_t first, size_t count) {
+  int has = object != NULL && is_a(object, type, seen);
+#pragma GCC unroll 16
+  for (size_t i = first; i < count; ++i) has = has && ((PyObject **)(object + 1))[i] != NULL;
+  if (!has) refuse(object, type, fields, first);
+  return has;
+}
+
 #define HAS_FIELDS(object, Struct, prefix) \
-  has_fields((PyObject *)(object), prefix##_type, prefix##_fields, 0, FIELD_COUNT(Struct))
+  has_fields((PyObject *)(object), prefix##_type, &prefix##_seen, prefix##_fields, 0, \
+             FIELD_COUNT(Struct))
 
 static int is_publisher(PyObject *object) {
   const size_t first = (offsetof(Entity, dispatcher) - sizeof(PyObject)) / sizeof(PyObject *);
-  return has_fields(object, entity_type, entity_fields, first, FIELD_COUNT(Entity));
+  return has_fields(object, entity_type, &publisher_seen, entity_fields, first,
+                    FIELD_COUNT(Entity));
 }
 
 /* Replaces a field by a new object, or fails if there is none. */
@@ -783,7 +834,7 @@ static int call_method(PyObject *object, const char *name) {
 static PyObject *state_hash_of(PyObject *node) {
   PyObject *state, *hash;
   if (node == Py_None) return Py_NewRef(zero);
-  if (PyObject_TypeCheck(node, entity_type) && ((Entity *)node)->state != NULL)
+  if (is_a(node, entity_type, &node_seen) && ((Entity *)node)->state != NULL)
     state = Py_NewRef(((Entity *)node)->state);
   else
     state = PyObject_GetAttrString(node, "state");
@@ -801,7 +852,7 @@ static int record_end(Dispatcher *self, PyObject *recorder, Loop *loop, Event *e
   if (recorder == Py_None) return set(&self->unrecorded, Py_NewRef(zero));
   Py_INCREF(recorder);
   for (int i = 0; i < 8; ++i) Py_INCREF(row[i]);
-  if (PyObject_TypeCheck(recorder, chain_type))
+  if (is_a(recorder, chain_type, &chain_seen))
     result = chain_end_event((Chain *)recorder, row, 8);
   else
     result = PyObject_CallMethod(recorder, "end_event", "OOOOOOOO", row[0], row[1], row[2], row[3],
@@ -828,13 +879,14 @@ static int tell_observers(Dispatcher *self) {
   return failed ? -1 : 0;
 }
 
-static PyObject *dispatcher_end_event(Dispatcher *self, PyObject *Py_UNUSED(none)) {
-  PyObject *node, *recorder, *state_hash = NULL, *result = NULL;
+static int end_event(Dispatcher *self) {
+  PyObject *node, *recorder, *state_hash = NULL;
+  int failed = 1;
   Event *event;
   Loop *loop;
   if (!HAS_FIELDS(self, Dispatcher, dispatcher) || settle_entities(self) < 0 ||
       !HAS_FIELDS(self, Dispatcher, dispatcher))
-    return NULL;
+    return -1;
   event = (Event *)Py_NewRef(self->event);
   loop = (Loop *)Py_NewRef(self->loop);
   recorder = Py_NewRef(self->recorder);
@@ -848,15 +900,69 @@ static PyObject *dispatcher_end_event(Dispatcher *self, PyObject *Py_UNUSED(none
       record_end(self, recorder, loop, event, state_hash) == 0 && HAS_FIELDS(loop, Loop, loop) &&
       add_one(&loop->events) == 0 && set(&event->flags, Py_NewRef(zero)) == 0 &&
       set(&event->quiet, Py_NewRef(Py_False)) == 0 && tell_observers(self) == 0)
-    result = Py_NewRef(Py_None);
+    failed = 0;
   Py_XDECREF(state_hash);
   Py_DECREF(recorder);
   Py_DECREF(loop);
   Py_DECREF(event);
-  return result;
+  return failed ? -1 : 0;
+}
+
+static PyObject *dispatcher_end_event(Dispatcher *self, PyObject *Py_UNUSED(none)) {
+  return end_event(self) < 0 ? NULL : Py_NewRef(Py_None);
+}
+
+enum { HANDLE, ENTITY, NODE, KIND, CALLBACK, ARGS, CAUSE_EVENT, CAUSE_OUTPUT, INPUT_HASH, CALL };
+
+/* What calls the callback is Python, as who looks at the stack finds its frame there, and what a
+   callback raises passes through it. */
+static int run_event(Dispatcher *self, PyObject *const *call) {
+  Event *event;
+  int failed;
+  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || !HAS_FIELDS(self->event, Event, event))
+    return -1;
+  event = (Event *)Py_NewRef(self->event);
+  failed = set(&event->handle, Py_NewRef(call[HANDLE])) < 0 ||
+           set(&event->entity, Py_NewRef(call[ENTITY])) < 0 ||
+           set(&event->node, Py_NewRef(call[NODE])) < 0 ||
+           set(&event->kind, Py_NewRef(call[KIND])) < 0 ||
+           set(&event->cause_event, Py_NewRef(call[CAUSE_EVENT])) < 0 ||
+           set(&event->cause_output, Py_NewRef(call[CAUSE_OUTPUT])) < 0 ||
+           set(&event->input_hash, Py_NewRef(call[INPUT_HASH])) < 0 ||
+           done(PyObject_CallMethodObjArgs((PyObject *)self, call_back, call[HANDLE],
+                                           call[CALLBACK], call[ARGS], NULL)) < 0 ||
+           end_event(self) < 0 || !HAS_FIELDS(event, Event, event);
+  if (!failed && event->on_end != Py_None) {
+    PyObject *on_end = event->on_end;
+    event->on_end = Py_NewRef(Py_None);
+    failed = called(on_end) < 0;
+    Py_DECREF(on_end);
+  }
+  Py_DECREF(event);
+  return failed ? -1 : 0;
+}
+
+static int execute(Dispatcher *self, PyObject *const *call, int is_decided) {
+  const int is_steered =
+      is_decided || self->before == NULL ? 0 : PyObject_IsTrue(self->before);
+  if (is_steered == 0) return run_event(self, call);
+  if (is_steered < 0) return -1;
+  return done(PyObject_CallMethod((PyObject *)self, "ask_and_execute", "OOOOOOOOO", call[HANDLE],
+                                  call[ENTITY], call[NODE], call[KIND], call[CALLBACK],
+                                  call[ARGS], call[CAUSE_EVENT], call[CAUSE_OUTPUT],
+                                  call[INPUT_HASH]));
+}
+
+static PyObject *dispatcher_execute(Dispatcher *self, PyObject *const *args, Py_ssize_t count) {
+  int is_decided;
+  if (check_count("execute", count, CALL, CALL + 1) < 0) return NULL;
+  is_decided = count > CALL ? PyObject_IsTrue(args[CALL]) : 0;
+  if (is_decided < 0 || execute(self, args, is_decided) < 0) return NULL;
+  Py_RETURN_NONE;
 }
 
 static PyMethodDef dispatcher_methods[] = {
+    {"execute", (PyCFunction)(void (*)(void))dispatcher_execute, METH_FASTCALL, NULL},
     {"end_event", (PyCFunction)dispatcher_end_event, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
@@ -881,7 +987,7 @@ static int is_full(PyObject *queue, PyObject *keep) {
 static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
   Entity *to = (Entity *)subscription;
   int is_it;
-  if (!PyObject_TypeCheck(subscription, entity_type) || to->queue == NULL || to->keep == NULL ||
+  if (!is_a(subscription, entity_type, &subscription_seen) || to->queue == NULL || to->keep == NULL ||
       to->active == NULL) {
     PyErr_SetString(PyExc_TypeError, "a subscription has no queue");
     return -1;
@@ -985,7 +1091,7 @@ static PyObject *publisher_send(Entity *self, PyObject *const *args, Py_ssize_t 
   if (self->observers != Py_None || self->links != Py_None || self->history != Py_None ||
       self->offers != Py_None || !PyList_Check(self->subscriptions) ||
       (recorder != Py_None &&
-       (self->channel == Py_None || !PyObject_TypeCheck(recorder, chain_type))))
+       (self->channel == Py_None || !is_a(recorder, chain_type, &chain_seen))))
     return PyObject_CallMethod((PyObject *)self, "send_any", "OO", args[0], content_hash);
   Py_INCREF(dispatcher);
   failed = send_plainly(self, dispatcher, args[0], content_hash);
@@ -993,29 +1099,154 @@ static PyObject *publisher_send(Entity *self, PyObject *const *args, Py_ssize_t 
   return failed ? NULL : Py_NewRef(Py_None);
 }
 
+/* Whether the line that publishes is to be looked up (concurrency/code_lines.py); -1 with an
+   error. */
+static int is_site_due(Entity *self) {
+  Dispatcher *dispatcher = (Dispatcher *)self->dispatcher;
+  Sites *sites = (Sites *)self->sites;
+  PyObject *numbers[4];
+  int due;
+  if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher) ||
+      !HAS_FIELDS(dispatcher->event, Event, event) || !HAS_FIELDS(sites, Sites, sites))
+    return -1;
+  numbers[0] = self->count, numbers[1] = sites->due;
+  numbers[2] = ((Event *)dispatcher->event)->entity, numbers[3] = sites->running;
+  for (int i = 0; i < 4; ++i) Py_INCREF(numbers[i]);
+  due = PyObject_RichCompareBool(numbers[0], numbers[1], Py_EQ);
+  if (due == 0) due = PyObject_RichCompareBool(numbers[2], numbers[3], Py_NE);
+  for (int i = 0; i < 4; ++i) Py_DECREF(numbers[i]);
+  return due;
+}
+
+static PyObject *publisher_publish(Entity *self, PyObject *message) {
+  PyObject *serialize, *data, *result;
+  const int due = is_publisher((PyObject *)self) ? is_site_due(self) : -1;
+  if (due < 0) return NULL;
+  if (due || self->serialize == NULL)
+    return PyObject_CallMethod((PyObject *)self, "publish_any", "(O)", message);
+  serialize = Py_NewRef(self->serialize);
+  data = PyObject_CallFunctionObjArgs(serialize, message, NULL);
+  Py_DECREF(serialize);
+  result = data == NULL ? NULL : publisher_send(self, &data, 1);
+  Py_XDECREF(data);
+  return result;
+}
+
 static PyMethodDef publisher_methods[] = {
+    {"publish", (PyCFunction)publisher_publish, METH_O, NULL},
     {"send", (PyCFunction)(void (*)(void))publisher_send, METH_FASTCALL, NULL},
     {NULL, NULL, 0, NULL},
 };
 
 static PyMethodDef no_methods[] = {{NULL, NULL, 0, NULL}};
 
-/* The fields of an entity, and the method of a publisher. */
-static PyObject *publisher_made(void) {
-  PyType_Slot slots[] = {{Py_tp_methods, publisher_methods}, {0, NULL}};
+/* -- Subscription ------------------------------------------------------------------------------- */
+
+/* Whether an attribute is an object; -1 with an error. */
+static int has(PyObject *object, PyObject *name, PyObject *wanted) {
+  PyObject *found = PyObject_GetAttr(object, name);
+  Py_XDECREF(found);
+  return found == NULL ? -1 : found == wanted;
+}
+
+static int is_free(PyObject *wrapper) {
+  PyObject *group = PyObject_GetAttr(wrapper, callback_group);
+  const int free = group == NULL ? -1 : has(group, active_entity, Py_None);
+  Py_XDECREF(group);
+  return free;
+}
+
+/* Whether the next arrival is a message for a plain function that may run now; -1 with an error. */
+static int is_usual(Entity *self) {
+  PyObject *wrapper = self->wrapper, *callback = self->callback;
+  Entity *node = (Entity *)self->node;
+  int usual = 0;
+  if (node == NULL || !is_a((PyObject *)node, entity_type, &node_seen) || node->mailbox != Py_None || self->queue == NULL ||
+      (PyObject *)Py_TYPE(self->queue) != deque_type || PyObject_Length(self->queue) == 0 ||
+      self->destroyed != Py_False || self->own_group != Py_False || self->coroutine != Py_False ||
+      self->with_info != Py_False || wrapper == NULL || callback == NULL)
+    return 0;
+  Py_INCREF(wrapper);
+  Py_INCREF(callback);
+  usual = is_free(wrapper);
+  if (usual > 0) usual = has(wrapper, user_callback, callback);
+  if (usual > 0) usual = has(wrapper, raw, Py_False);
+  Py_DECREF(callback);
+  Py_DECREF(wrapper);
+  if (usual >= 0 || !PyErr_ExceptionMatches(PyExc_AttributeError)) return usual;
+  PyErr_Clear();
+  return 0;
+}
+
+/* Runs the callback for a delivery of the middleware (subscription.Delivery). */
+static int run_subscription(Entity *self, PyObject *delivery) {
+  PyObject *message, *args = NULL, *kind = PyLong_FromLong(SUBSCRIPTION);
+  PyObject *deserialize = Py_NewRef(self->deserialize), *callback = Py_NewRef(self->callback);
+  PyObject *entity = Py_NewRef(self->entity_id), *node = Py_NewRef(self->node);
+  Dispatcher *dispatcher = (Dispatcher *)Py_NewRef(self->dispatcher);
+  int failed = 1;
+  message = PyObject_CallFunctionObjArgs(deserialize, PyTuple_GetItem(delivery, 4), NULL);
+  if (message != NULL) args = PyTuple_Pack(1, message);
+  Py_XDECREF(message);
+  if (kind != NULL && args != NULL && HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) {
+    PyObject *call[CALL] = {(PyObject *)self, entity, node, kind, callback, args};
+    for (int i = 0; i < 3; ++i) call[CAUSE_EVENT + i] = PyTuple_GetItem(delivery, 5 + i);
+    failed = execute(dispatcher, call, 0);
+  }
+  Py_DECREF(dispatcher);
+  Py_DECREF(node);
+  Py_DECREF(entity);
+  Py_DECREF(callback);
+  Py_DECREF(deserialize);
+  Py_XDECREF(kind);
+  Py_XDECREF(args);
+  return failed;
+}
+
+static PyObject *subscription_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
+  PyObject *delivery;
+  int failed = 1;
+  const int usual = is_usual(self);
+  if (usual < 0) return NULL;
+  if (!usual || self->queue == NULL || self->callback == NULL || self->deserialize == NULL ||
+      self->node == NULL || self->entity_id == NULL || self->dispatcher == NULL)
+    return PyObject_CallMethod((PyObject *)self, "dispatch_any", NULL);
+  delivery = PyObject_CallFunctionObjArgs(deque_popleft, self->queue, NULL);
+  if (delivery == NULL) return NULL;
+  if (PyTuple_Check(delivery) && PyTuple_Size(delivery) == 10)
+    failed = run_subscription(self, delivery);
+  else
+    PyErr_SetString(PyExc_ValueError, "a delivery has ten parts");
+  Py_DECREF(delivery);
+  return failed ? NULL : Py_NewRef(Py_None);
+}
+
+static PyMethodDef subscription_methods[] = {
+    {"dispatch", (PyCFunction)subscription_dispatch, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+/* The fields of an entity, and the method of a publisher or subscription. */
+static PyObject *entity_with(PyMethodDef *methods, const char *name) {
+  PyType_Slot slots[] = {{Py_tp_methods, methods}, {0, NULL}};
   PyType_Spec spec = {
-      "rsltrace._core.PublisherFields", sizeof(Entity), 0,
-      Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, slots,
+      name, sizeof(Entity), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, slots,
   };
-  return PyType_FromSpecWithBases(&spec, (PyObject *)entity_type);
+  return entity_type == NULL ? NULL : PyType_FromSpecWithBases(&spec, (PyObject *)entity_type);
 }
 
 static int add_types(PyObject *module) {
   deque_type = attribute_of("collections", "deque");
   deque_append = deque_type == NULL ? NULL : PyObject_GetAttrString(deque_type, "append");
+  deque_popleft = deque_type == NULL ? NULL : PyObject_GetAttrString(deque_type, "popleft");
   hash64 = attribute_of("xxhash", "xxh3_64_intdigest");
   zero = PyLong_FromLong(0);
   output_kind = PyUnicode_InternFromString("output_kind");
+  call_back = PyUnicode_InternFromString("call_back");
+  callback_group = PyUnicode_InternFromString("callback_group");
+  active_entity = PyUnicode_InternFromString("_active_entity");
+  user_callback = PyUnicode_InternFromString("_callback");
+  raw = PyUnicode_InternFromString("raw");
   draw_kind = PyLong_FromLong(DRAW);
   no_sequence = PyLong_FromUnsignedLong(U32);
   buffer_type = (PyTypeObject *)PyType_FromSpec(&buffer_spec);
@@ -1024,6 +1255,7 @@ static int add_types(PyObject *module) {
   event_type = event_made(event_fields, no_methods);
   dispatcher_type = dispatcher_made(dispatcher_fields, dispatcher_methods);
   entity_type = entity_made(entity_fields, no_methods);
+  sites_type = sites_made(sites_fields, no_methods);
   const struct {
     const char *name;
     PyObject *object;
@@ -1031,10 +1263,15 @@ static int add_types(PyObject *module) {
       {"RecordBuffer", (PyObject *)buffer_type},   {"EventChain", (PyObject *)chain_type},
       {"LoopFields", (PyObject *)loop_type},       {"EventFields", (PyObject *)event_type},
       {"EventEnd", (PyObject *)dispatcher_type},   {"EntityFields", (PyObject *)entity_type},
-      {"PublisherFields", entity_type == NULL ? NULL : publisher_made()},
+      {"PublisherFields", entity_with(publisher_methods, "rsltrace._core.PublisherFields")},
+      {"SitesFields", (PyObject *)sites_type},
+      {"SubscriptionFields",
+       entity_with(subscription_methods, "rsltrace._core.SubscriptionFields")},
   };
-  if (deque_append == NULL || hash64 == NULL || zero == NULL || output_kind == NULL ||
-      draw_kind == NULL || no_sequence == NULL)
+  if (deque_append == NULL || deque_popleft == NULL || hash64 == NULL || zero == NULL ||
+      output_kind == NULL || call_back == NULL || callback_group == NULL ||
+      active_entity == NULL || user_callback == NULL || raw == NULL || draw_kind == NULL ||
+      no_sequence == NULL)
     return -1;
   for (size_t i = 0; i < sizeof all / sizeof *all; ++i)
     if (all[i].object == NULL || PyModule_AddObjectRef(module, all[i].name, all[i].object) < 0)

@@ -34,6 +34,9 @@ LoopFields = object
 EventFields = object
 EntityFields = object
 PublisherFields = object
+SubscriptionFields = object
+SitesFields = object
 if core is not None and not TYPE_CHECKING:
     LoopFields, EventFields = core.LoopFields, core.EventFields
     EntityFields, PublisherFields = core.EntityFields, core.PublisherFields
+    SubscriptionFields, SitesFields = core.SubscriptionFields, core.SitesFields

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import subprocess
 import sys
+import traceback
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,11 @@ from rsltrace.compiled import core
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.timer_queue import timer_queue
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher, PythonEventEnd
-from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
+from rsltrace.simulation.middleware.events.observer import (
+    EventCall,
+    EventObserver,
+    ObserverOrder,
+)
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher, Transport
 from rsltrace.simulation.middleware.qos.policies import DEFAULT_QOS, History
@@ -45,6 +50,32 @@ class Breaking(EventObserver):
         return 7
 
 
+class Asking(EventObserver):
+    """Rejects every third event."""
+
+    order = ObserverOrder.EDITS
+    asked = 0
+
+    def before_event(self, call: EventCall) -> bool:
+        self.asked += 1
+        return self.asked % 3 > 0
+
+
+class Handler:
+    """Notes what callbacks raise, and what Python says is being handled meanwhile."""
+
+    def __init__(self) -> None:
+        self.log: list[Any] = []
+
+    def raised(self, error: BaseException, handle: Any) -> None:
+        assert sys.exc_info()[1] is error
+        places = [frame.name for frame in traceback.extract_tb(error.__traceback__)]
+        of_python = [place for place in places if place not in ("execute", "end_event")]
+        self.log.append((type(error), handle, type(error.__context__), of_python))
+        if isinstance(error, LookupError):
+            raise error
+
+
 class OtherQueue(deque[Any]):
     """As a wait set puts in place of a queue."""
 
@@ -56,8 +87,10 @@ class Run:
         self.compiled = compiled
         self.loop = EventLoop(start_ns=5, timers=timer_queue("creation"))
         self.dispatcher = Dispatcher(self.loop)
-        handler: Any = None
-        self.node = Participant(self.dispatcher, "node", "/", handler)
+        self.handler: Any = Handler()
+        self.dispatcher.exception_handler = self.handler
+        self.node = Participant(self.dispatcher, "node", "/", self.handler)
+        self.asking = Asking()
         self.observer = Breaking()
         self.dispatcher.add_observer(self.observer)
         type_: Any = SimpleNamespace(
@@ -81,6 +114,48 @@ class Run:
         for subscription in self.subscriptions:
             self.publisher.connect(subscription)
 
+    def execute(self, *call: Any) -> None:
+        if self.compiled:
+            self.dispatcher.execute(*call)
+        else:
+            PythonEventEnd.execute(self.dispatcher, *call)
+
+    def run_event(self, rng: random.Random) -> None:
+        """Run a callback that may raise, run another event, or leave something for the end."""
+        what = rng.choice(["", "", "raise", "nest", "end", "steal"])
+        error = rng.choice([ValueError, KeyError, SystemExit, KeyboardInterrupt, StopIteration])
+        data, log = rng.randbytes(9), self.handler.log
+        nested = (None, 0, None, 2, lambda *args: log.append(args), (1, 2), 0, 0, 5)
+
+        def callback(*args: Any) -> None:
+            log.append(args)
+            self.publisher.send(data)
+            if what == "raise":
+                try:
+                    raise OSError
+                except OSError:
+                    raise error("it breaks")  # noqa: B904
+            elif what == "nest":
+                self.execute(*nested)
+            elif what == "end":
+                self.dispatcher.event.on_end = lambda: log.append("end")
+            elif what == "steal":
+                del self.dispatcher.event.on_end
+
+        is_steered = rng.random() < 0.3
+        if is_steered:
+            self.dispatcher.add_observer(self.asking)
+        args = rng.choice([(), (1,), (1, "2")])
+        decided = rng.choice([(), (), (True,), (0,)])
+        try:
+            self.execute("handle", 3, self.node, 3, callback, args, 1, 2, 7, *decided)
+        except (AttributeError, LookupError) as error_:
+            log.append((type(error_), str(error_).split("'")[-2:][0][:6]))
+            self.dispatcher.event.on_end = None
+        finally:
+            if is_steered:
+                self.dispatcher.remove_observer(self.asking)
+
     def step(self, rng: random.Random) -> Any:
         """Do something; return its outcome and the state of everything."""
         self.loop.now_ns += rng.randrange(3)
@@ -95,7 +170,9 @@ class Run:
         data, given = rng.randbytes(rng.randrange(300)), rng.choice([(), (None,), (1 << 63,)])
         outcome: Any = None
         try:
-            if rng.random() < 0.5:
+            if rng.random() < 0.4:
+                self.run_event(rng)
+            elif rng.random() < 0.5:
                 (self.publisher.send if self.compiled else self.publisher.send_any)(data, *given)
             elif self.compiled:
                 self.dispatcher.end_event()
@@ -116,6 +193,8 @@ class Run:
             },
             (self.loop.events, self.loop.activity_ns, self.dispatcher.unrecorded),
             (event.flags, event.quiet, self.publisher._count),
+            (event.handle, event.entity, event.kind, event.cause_event, event.cause_output),
+            (event.input_hash, event.on_end is None, list(self.handler.log), self.asking.asked),
             None if recorder is None else (recorder.index, recorder.chain_hash, recorder.outputs),
             None if recorder is None else recorder.writer._buffer.rows(),
         )

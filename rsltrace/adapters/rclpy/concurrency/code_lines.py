@@ -10,6 +10,7 @@ import sys
 from types import CodeType, FrameType, FunctionType, MethodType
 from typing import Any
 
+from rsltrace.compiled import SitesFields
 from rsltrace.guard.callers import is_user_file, user_frame
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import callback_code, imported_file
@@ -22,14 +23,12 @@ _STRIDE = 256
 """Callers are looked up for the first 32 outputs of each callback; then for about every 256th."""
 
 
-class CallSites:
+class CallSites(SitesFields):
     """The lines from which one entity sends.
 
     The sender calls ``look`` if its count equals ``due``, or if the entity whose callback runs is
     not ``running``.
     """
-
-    __slots__ = ("_dispatcher", "_entity", "_lookups", "_recorded", "due", "running")
 
     def __init__(self, dispatcher: Dispatcher, entity: int) -> None:
         self._dispatcher = dispatcher

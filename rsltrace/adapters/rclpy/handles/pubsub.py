@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from rsltrace.adapters.rclpy.concurrency.blocking_calls import wait
 from rsltrace.adapters.rclpy.concurrency.code_lines import CallSites
@@ -18,6 +18,7 @@ from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import message_type
+from rsltrace.compiled import SubscriptionFields, core
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.entity import callback_name
 from rsltrace.simulation.middleware.interface import callback_source
@@ -81,7 +82,7 @@ class PublisherHandle(EntityHandle, Publisher):
         self._sites = CallSites(node.dispatcher, self.entity_id)
         domain.graph.add_publisher(self)
 
-    def publish(self, msg: Any) -> None:
+    def publish_any(self, msg: Any) -> None:
         """Publish a message: a snapshot of it goes to every connected subscription."""
         serialize = self._serialize  # a local variable is called faster
         data = serialize(msg)
@@ -89,6 +90,11 @@ class PublisherHandle(EntityHandle, Publisher):
         if self._count == sites.due or self._event.entity != sites.running:
             sites.look(self._count)
         self.send(data)
+
+    if core is None or TYPE_CHECKING:
+        publish = publish_any
+        """The compiled one leaves to ``publish_any`` what is to be looked up, and to ``send_any``
+        what that is for."""
 
     def publish_raw(self, data: bytes) -> None:
         """Publish a serialized message. Raises ValueError if it is not of this topic's type."""
@@ -122,7 +128,7 @@ class PublisherHandle(EntityHandle, Publisher):
     settle, trace_name = Publisher.settle, Publisher.trace_name
 
 
-class SubscriptionHandle(ReceiverHandle, Subscription):
+class SubscriptionHandle(ReceiverHandle, Subscription, SubscriptionFields):
     """Stands in for ``_rclpy.Subscription``."""
 
     lists = "subscriptions"
@@ -152,7 +158,8 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         )
         graph.add_subscription(self)
 
-    def dispatch(self) -> None:
+    def dispatch_any(self) -> None:
+        """Run the callback for the oldest arrival, if it may run."""
         if not self.may_run():
             return
         wrapper = self.wrapper
@@ -172,6 +179,13 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         self.dispatcher.execute(
             self, self.entity_id, self.node, SUBSCRIPTION, callback, args, event, position, digest
         )
+
+    if core is None or TYPE_CHECKING:
+        dispatch = dispatch_any
+    else:
+        dispatch = core.SubscriptionFields.dispatch
+        """Does the usual case, a free group and a plain function that gets the message alone, and
+        leaves the others to ``dispatch_any``."""
 
     def _as_received(self, data: bytes) -> bytes:
         """Return the bytes as Fast DDS does: padded to a multiple of four between processes.

@@ -90,7 +90,7 @@ class EntityRegistry:
 
 
 class PythonEventEnd:
-    """How an event ends. The compiled module has an equal class."""
+    """How an event runs and ends. The compiled module has an equal class."""
 
     loop: EventLoop
     event: CurrentEvent
@@ -98,7 +98,44 @@ class PythonEventEnd:
     recorder: Recorder | None
     unrecorded: int
     _pending: list[Recordable]
+    _before: tuple[EventObserver, ...]
     _after: tuple[EventObserver, ...]
+    ask_and_execute: Callable[..., None]
+    call_back: Callable[..., None]
+
+    def execute(
+        self,
+        handle: Dispatchable,
+        entity: int,
+        node: EventOwner | None,
+        kind: int,
+        callback: Callable[..., object],
+        args: tuple[Any, ...],
+        cause_event: int,
+        cause_output: int,
+        input_hash: int,
+        is_decided: int = False,
+    ) -> None:
+        """Run one event: call ``callback(*args)`` and record what came of it. ``is_decided``: the
+        observers have already been asked."""
+        if self._before and not is_decided:
+            self.ask_and_execute(
+                handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
+            )
+            return
+        event = self.event
+        event.handle = handle
+        event.entity = entity
+        event.node = node
+        event.kind = kind
+        event.cause_event = cause_event
+        event.cause_output = cause_output
+        event.input_hash = input_hash
+        self.call_back(handle, callback, args)
+        self.end_event()
+        if event.on_end is not None:
+            on_end, event.on_end = event.on_end, None
+            on_end()
 
     def end_event(self) -> None:
         """Record the current event, possibly a later part of the one ``execute`` began."""
@@ -198,45 +235,21 @@ class Dispatcher(EventEnd):
         """Ask observers before an event; the first that rejects it is the last one asked."""
         return all(observer.before_event(call) for observer in self._before)
 
-    def execute(
-        self,
-        handle: Dispatchable,
-        entity: int,
-        node: EventOwner | None,
-        kind: int,
-        callback: Callable[..., object],
-        args: tuple[Any, ...],
-        cause_event: int,
-        cause_output: int,
-        input_hash: int,
-        is_decided: int = False,
+    def ask_and_execute(self, *values: Any) -> None:
+        """Run one event unless an observer rejects it."""
+        call = EventCall(*values)
+        if self._accepted_by_observers(call):
+            self.execute(*call.values(), True)
+        call.end()
+
+    def call_back(
+        self, handle: Dispatchable, callback: Callable[..., object], args: tuple[Any, ...]
     ) -> None:
-        """Run one event: call ``callback(*args)`` and record what came of it. ``is_decided``: the
-        observers have already been asked."""
-        if self._before and not is_decided:
-            call = EventCall(
-                handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
-            )
-            if self._accepted_by_observers(call):
-                self.execute(*call.values(), True)
-            call.end()
-            return
-        event = self.event
-        event.handle = handle
-        event.entity = entity
-        event.node = node
-        event.kind = kind
-        event.cause_event = cause_event
-        event.cause_output = cause_output
-        event.input_hash = input_hash
+        """Call a callback. Compiled or not, who looks at a stack finds this frame above it."""
         try:
             callback(*args)
         except BaseException as error:
             self._raised(error, handle)
-        self.end_event()
-        if event.on_end is not None:
-            on_end, event.on_end = event.on_end, None
-            on_end()
 
     def _raised(self, error: BaseException, handle: Dispatchable) -> None:
         """Let the exception handler decide what happens next."""
