@@ -233,6 +233,7 @@ def test_a_run_leaves_no_memory_behind() -> None:
         "        run.step(dice) if number % 50 == 0 else run.publisher.send(bytes(9))\n"
         "        run.observer.breaks = ''\n"
         "        run.dispatcher.end_event()\n"
+        "        run.dispatcher.execute('handle', 1, None, 3, len, ('x',), 0, 0, 0)\n"
         "        run.subscriptions[2].queue.clear()\n"
         "        run.loop.ready.clear()\n"
         "        buffer = run.dispatcher.recorder.writer._buffer\n"
