@@ -943,8 +943,7 @@ static int run_event(Dispatcher *self, PyObject *const *call) {
 }
 
 static int execute(Dispatcher *self, PyObject *const *call, int is_decided) {
-  const int is_steered =
-      is_decided || self->before == NULL ? 0 : PyObject_IsTrue(self->before);
+  const int is_steered = is_decided || self->before == NULL ? 0 : PyObject_IsTrue(self->before);
   if (is_steered == 0) return run_event(self, call);
   if (is_steered < 0) return -1;
   return done(PyObject_CallMethod((PyObject *)self, "ask_and_execute", "OOOOOOOOO", call[HANDLE],
@@ -1161,7 +1160,8 @@ static int is_usual(Entity *self) {
   PyObject *wrapper = self->wrapper, *callback = self->callback;
   Entity *node = (Entity *)self->node;
   int usual = 0;
-  if (node == NULL || !is_a((PyObject *)node, entity_type, &node_seen) || node->mailbox != Py_None || self->queue == NULL ||
+  if (node == NULL || !is_a((PyObject *)node, entity_type, &node_seen) ||
+      node->mailbox != Py_None || self->queue == NULL ||
       (PyObject *)Py_TYPE(self->queue) != deque_type || PyObject_Length(self->queue) == 0 ||
       self->destroyed != Py_False || self->own_group != Py_False || self->coroutine != Py_False ||
       self->with_info != Py_False || wrapper == NULL || callback == NULL)
