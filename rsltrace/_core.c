@@ -651,8 +651,10 @@ typedef struct {
   PyObject *due, *running;
 } Sites;
 
-static PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type, *sites_type, *chain_type;
-static PyObject *deque_type, *deque_append, *deque_popleft, *hash64, *zero, *output_kind, *call_back;
+static PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type, *sites_type;
+static PyTypeObject *chain_type;
+static PyObject *deque_type, *deque_append, *deque_popleft, *hash64, *zero, *output_kind;
+static PyObject *call_back;
 static PyObject *loop_seen, *event_seen, *dispatcher_seen, *sites_seen; /* subclasses: see is_a */
 static PyObject *publisher_seen, *subscription_seen, *node_seen, *chain_seen;
 static PyObject *callback_group, *active_entity, *user_callback, *raw;
@@ -986,8 +988,8 @@ static int is_full(PyObject *queue, PyObject *keep) {
 static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
   Entity *to = (Entity *)subscription;
   int is_it;
-  if (!is_a(subscription, entity_type, &subscription_seen) || to->queue == NULL || to->keep == NULL ||
-      to->active == NULL) {
+  if (!is_a(subscription, entity_type, &subscription_seen) || to->queue == NULL ||
+      to->keep == NULL || to->active == NULL) {
     PyErr_SetString(PyExc_TypeError, "a subscription has no queue");
     return -1;
   }
