@@ -168,3 +168,30 @@ def test_a_run_leaves_no_memory_behind() -> None:
         "assert go(30000) - first < 500, 'KiB'\n"
     )
     subprocess.run([sys.executable, "-X", "dev", "-c", code], cwd=ROOT, check=True)
+
+
+@needs_core
+def test_garbage_that_publishes_while_a_message_is_sent_is_harmless() -> None:
+    code = (
+        "import gc\n"
+        "from tests.middleware.test_compiled import Run\n"
+        "run = Run(compiled=True, recorded=False)\n"
+        "run.publisher._count = 10**6\n"
+        "class Garbage:\n"
+        "    def __init__(self):\n"
+        "        self.itself = self\n"
+        "    def __del__(self):\n"
+        "        run.publisher.send(b'')\n"
+        "kept = []\n"
+        "gc.set_threshold(1)\n"
+        "for _ in range(500):\n"
+        "    Garbage()\n"
+        "    run.publisher.send(b'')\n"
+        "    kept += run.subscriptions[2].queue\n"
+        "    run.subscriptions[2].queue.clear()\n"
+        "gc.collect()\n"
+        "kept += run.subscriptions[2].queue\n"
+        "assert len(kept) == 1000\n"
+        "assert all(10**6 < delivery[-1] <= 10**6 + 1000 for delivery in kept)\n"
+    )
+    subprocess.run([sys.executable, "-X", "dev", "-c", code], cwd=ROOT, check=True)
