@@ -1043,9 +1043,15 @@ static PyObject *delivery_of(Loop *loop, PyObject *now_ns, PyObject *data, PyObj
                              PyObject *position, PyObject *count) {
   PyObject *items[] = {now_ns,   zero,   zero,   Py_None, data, loop->events,
                        position, digest, now_ns, count};
-  PyObject *delivery = PyTuple_New(10);
-  for (int i = 0; delivery != NULL && i < 10; ++i)
-    PyTuple_SetItem(delivery, i, Py_NewRef(items[i]));
+  PyObject *delivery;
+  for (int i = 0; i < 10; ++i) Py_INCREF(items[i]);
+  delivery = PyTuple_New(10); /* a collection of garbage may publish, and replace fields */
+  for (int i = 0; i < 10; ++i) {
+    if (delivery == NULL)
+      Py_DECREF(items[i]);
+    else
+      PyTuple_SetItem(delivery, i, items[i]);
+  }
   return delivery;
 }
 

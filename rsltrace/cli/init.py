@@ -14,7 +14,7 @@ from rsltrace.cli.schema import schema_text
 from rsltrace.errors import BagError, OutputError
 from rsltrace.terminal import tell
 from rsltrace.trace.model.operation import NODE_TOPICS
-from rsltrace.trace.model.texts import format_duration, format_seconds
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
 if TYPE_CHECKING:
     from rsltrace.job.reading.node_source import NodeSource
@@ -186,18 +186,19 @@ def _bag_text(source: str, folder: Path) -> str:
             lines = [
                 f"  - path: {_yaml(path)}",
                 f"    # from {format_seconds(bag.recording_start_ns)} s on, {length} long",
-                *(f"    # note: {note}" for note in bag.notes),
+                *(f"    # note: {printable(note)}" for note in bag.notes),
                 "    topics:",
             ]
-            width = max(len(topic.name) for topic in bag.topics)
+            names = [_yaml(topic.name) for topic in bag.topics]
+            width = max(map(len, names))
             heard = [topic for topic in bag.topics if topic.name not in NODE_TOPICS]
             lines += [
                 f"      {'-' if topic in heard or not heard else '# -'} "
-                f"{topic.name:<{width}}  # {topic.type_name}, {topic.message_count} messages"
-                for topic in bag.topics
+                f"{name:<{width}}  # {printable(topic.type_name)}, {topic.message_count} messages"
+                for name, topic in zip(names, bag.topics, strict=True)
             ]
             if bag.skipped:
-                lines.append(f"    # not played: {', '.join(bag.skipped)}")
+                lines.append(f"    # not played: {printable(', '.join(bag.skipped))}")
             lines += ["    # rate: 1.0", "    # remappings: {/recorded: /other}"]
             return "\n".join(lines) + "\n"
     except BagError as error:

@@ -79,6 +79,14 @@ def test_what_is_no_profile_is_refused(bad: object, expected: str) -> None:
         parse_qos(bad)
 
 
+@pytest.mark.parametrize("around", ["{{{}}}", "[{{{}}}, *a6]"])
+def test_a_value_that_repeats_itself_by_references_makes_no_long_error(around: str) -> None:
+    lists = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 6)}]" for n in range(1, 7)]
+    with pytest.raises(ValueError, match="expected") as raised:
+        parse_qos(around.format(", ".join(["a0: &a0 [x]", *lists])))
+    assert len(str(raised.value)) < 1000
+
+
 def test_a_topic_has_one_qos_only_if_its_publishers_agree() -> None:
     def topic(*offered: BagQos) -> BagTopic:
         return BagTopic("/a", "m/msg/A", "cdr", offered, 0, None, "", "")

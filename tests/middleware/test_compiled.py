@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import subprocess
 import sys
@@ -248,3 +249,51 @@ def test_a_run_leaves_no_memory_behind() -> None:
         "assert go(30000) - first < 500, 'KiB'\n"
     )
     subprocess.run([sys.executable, "-X", "dev", "-c", code], cwd=ROOT, check=True)
+
+
+@needs_core
+def test_garbage_that_publishes_while_a_message_is_sent_is_harmless() -> None:
+    code = (
+        "import gc\n"
+        "from tests.middleware.test_compiled import Run\n"
+        "run = Run(compiled=True, recorded=False)\n"
+        "run.publisher._count = 10**6\n"
+        "class Garbage:\n"
+        "    def __init__(self):\n"
+        "        self.itself = self\n"
+        "    def __del__(self):\n"
+        "        run.publisher.send(b'')\n"
+        "kept = []\n"
+        "gc.set_threshold(1)\n"
+        "for _ in range(500):\n"
+        "    Garbage()\n"
+        "    run.publisher.send(b'')\n"
+        "    kept += run.subscriptions[2].queue\n"
+        "    run.subscriptions[2].queue.clear()\n"
+        "gc.collect()\n"
+        "kept += run.subscriptions[2].queue\n"
+        "assert len(kept) == 1000\n"
+        "assert all(10**6 < delivery[-1] <= 10**6 + 1000 for delivery in kept)\n"
+    )
+    subprocess.run([sys.executable, "-X", "dev", "-c", code], cwd=ROOT, check=True)
+
+
+@needs_core
+@pytest.mark.parametrize("compiled", ["1", "0"])
+def test_what_rclpy_would_not_copy_is_not_copied(compiled: str) -> None:
+    code = (
+        "import copy\n"
+        "from tests.middleware.test_compiled import Run\n"
+        "run = Run(compiled=False, recorded=False)\n"
+        "for entity in (run.publisher, run.node, run.subscriptions[0]):\n"
+        "    try:\n"
+        "        print(copy.copy(entity))\n"
+        "    except TypeError as error:\n"
+        "        print(error)\n"
+    )
+    environment = {**os.environ, "RSLTRACE_COMPILED": compiled}
+    words = [sys.executable, "-c", code]
+    said = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True).stdout
+    assert said.splitlines() == [
+        f"cannot pickle '{name}' object" for name in ("Publisher", "Participant", "Subscription")
+    ]

@@ -124,6 +124,20 @@ def test_a_job_from_a_node_and_a_bag_runs(rsltrace: Any, folder: Path) -> None:
     assert "check violated: eventually /hearer/own" in checked.stdout
 
 
+def test_odd_texts_of_a_bag_stay_on_their_line(rsltrace: Any, folder: Path) -> None:
+    db = sqlite3.connect(folder / "a.db3")
+    db.execute("UPDATE topics SET type = ? WHERE id = 1", ("a\nrsltrace: error: not true",))
+    db.execute("UPDATE topics SET name = '/odd: # x' WHERE id = 3")
+    db.commit()
+    db.close()
+    done = rsltrace("init", "--from", "a.db3")
+    assert done.returncode == 0, done.stderr
+    assert load_job(folder / "job.yaml").bags[0].topics == ("/n", "/odd: # x")
+    done = rsltrace("record", "job.yaml", "-o", "run.mcap", "--set", "bags.0.topics=[/n]")
+    assert done.returncode == 2
+    assert "type a\\nrsltrace: error: not true, which" in done.stderr
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("sources", [[], ["--from", "a.db3"], ["--from", "robot.nodes:Hearer"]])
 def test_each_kind_of_first_job_loads(rsltrace: Any, folder: Path, sources: list[str]) -> None:

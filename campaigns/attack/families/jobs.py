@@ -343,6 +343,7 @@ def _shouts(rng: Random, case: Case, corpus: Corpus) -> None:
     """What the command line adds: --set with everything, --ros-args, --until."""
     _ask(rng, case, _dumped(GOOD))
     case.names = (*case.names, "--set", "--until", "--seed", "--ros-args", "Error", "error")
+    case.user_code = True  # a node may not take the value as its parameter
     key = rng.choice(
         (
             "stop.duration",

@@ -110,7 +110,7 @@ def _another_run(rng: Random, case: Case, corpus: Corpus) -> None:
     )
     cut_a = a[: rng.choice((len(a), rng.randrange(2000, len(a))))]
     cut_b = b[: rng.choice((len(b), rng.randrange(2000, len(b))))]
-    attack_trace(case, rng, cut_a, cut_b, differs=True)
+    attack_trace(case, rng, cut_a, cut_b, differs=True, names=("original.mcap",))
 
 
 def _cut_before_the_first_segment(rng: Random, case: Case, corpus: Corpus) -> None:

@@ -16,14 +16,16 @@ Frame = tuple[str, int]
 """The file of a program or library, and an address in it."""
 
 _DEBUG_SECTION = b".debug_line"
+_OF_PYTHON = re.compile(r"(?:.*/)?(?:(?:lib)?python[\d.]*[dmt]*(?:\.so[\d.]*)?|lib-dynload/[^/]*)")
 _LAMBDA_CALL = "::operator()"
 
 
 @cache
 def _has_lines(module: str) -> bool:
-    """Return whether a file has debug information: without, no tool need be started."""
+    """Return whether a file has debug information: without, no tool need be started. The lines of
+    a Python interpreter are not those of its program."""
     try:
-        return _DEBUG_SECTION in Path(module).read_bytes()
+        return _OF_PYTHON.fullmatch(module) is None and _DEBUG_SECTION in Path(module).read_bytes()
     except OSError:
         return False
 

@@ -19,7 +19,7 @@ from rsltrace.run.stop_rules import end_ns_of, has_stop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import PREFIX_OWN
 from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds
+from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds, printable
 
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.handles.node import NodeHandle
@@ -200,8 +200,9 @@ def check_type(bag: str, topic: BagTopic) -> type:
         return get_message_class(topic.type_name)
     except SetupError as error:
         raise BagError(
-            f"{bag}: topic {topic.name} has type {topic.type_name}, which is not installed here. "
-            f"Install its package, or leave the topic out (exclude: [{topic.name}])\n  {error}"
+            f"{bag}: topic {topic.name} has type {printable(topic.type_name)}, which is not "
+            f"installed here. Install its package, or leave the topic out (exclude: [{topic.name}])"
+            f"\n  {error}"
         ) from error
 
 

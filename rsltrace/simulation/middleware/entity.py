@@ -92,6 +92,9 @@ class DomainEntity(EntityFields):
     def settle(self) -> bool:
         return self.node is not None
 
+    def __reduce_ex__(self, protocol: object) -> Any:
+        raise TypeError(f"cannot pickle '{type(self).__name__}' object")  # compiled or not
+
     def entity(self) -> Entity:
         detail = self.trace_detail()
         if source := callback_source(self.user_callback()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,6 +80,10 @@ LIVELINESS = (
 # An infinite duration in DDS, and in ROS 2 until Galactic.
 _DDS_INFINITE = (0x7FFFFFFF, 0xFFFFFFFF)
 
+# YAML's references can make a text of 1 kB a value whose whole text fills all memory.
+_short = reprlib.Repr()
+_short.maxlevel = 2
+
 
 def parse_qos(profiles: object) -> tuple[BagQos, ...]:
     """Return the profiles in a YAML text or parsed list. Raises ``ValueError`` for anything else.
@@ -90,7 +95,7 @@ def parse_qos(profiles: object) -> tuple[BagQos, ...]:
     if profiles is None:
         return ()
     if not isinstance(profiles, list):
-        raise ValueError(f"a list of QoS profiles was expected, not {profiles!r}")
+        raise ValueError(f"a list of QoS profiles was expected, not {_short.repr(profiles)}")
     return tuple(_profile(item) for item in profiles)
 
 
@@ -115,7 +120,7 @@ def _parse_text(text: str) -> tuple[BagQos, ...]:
 
 def _profile(item: object) -> BagQos:
     if not isinstance(item, dict):
-        raise ValueError(f"a QoS profile was expected, not {item!r}")
+        raise ValueError(f"a QoS profile was expected, not {_short.repr(item)}")
     depth = item.get("depth", 0)
     return BagQos(
         history=_policy(item.get("history"), HISTORY),
