@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.cli.output.event_json import EventJson
-from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import TraceError, near_or_all
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.terminal import line_writer
@@ -98,6 +97,8 @@ def _hex(value: int) -> str:
 
 
 if TYPE_CHECKING:
+    from rsltrace.conditions.trace_events import TraceCondition
+
     _TimeParam = click.ParamType[TimeInRun]
 else:
     _TimeParam = click.ParamType  # not generic before click 8.2
@@ -197,12 +198,18 @@ def cat(
         raise click.UsageError("--payloads needs --json")
     with Trace.open(trace) as opened:
         choice = _choice(opened, topics, nodes, entities, kinds, first, last)
-        condition = None if where is None else TraceCondition(where, opened)
+        condition = None if where is None else _condition(where, opened)
         events = _events(opened, choice, condition)
         write = line_writer()
         form = _json_form(opened, payloads) if as_json else EventLines(opened, code=code).line
         for event, outputs in islice(events, limit):
             write(form(event, outputs))
+
+
+def _condition(text: str, trace: Trace) -> TraceCondition:
+    from rsltrace.conditions.trace_events import TraceCondition
+
+    return TraceCondition(text, trace)
 
 
 def _json_form(trace: Trace, payloads: bool) -> Callable[[EventRecord, list[Output]], str]:

@@ -460,7 +460,10 @@ _HEAVY = (
         (["--help"], _HEAVY),
         (["--version"], _HEAVY),
         (["info", "a.mcap"], ("rsltrace.diff", "rsltrace.conditions", "rsltrace.trace.decode")),
-        (["cat", "a.mcap"], ("rsltrace.diff", "rsltrace.replay", "rsltrace.trace.decode")),
+        (
+            ["cat", "a.mcap"],
+            ("rsltrace.diff", "rsltrace.replay", "rsltrace.trace.decode", "rsltrace.conditions"),
+        ),
         (
             ["diff", "a.mcap", "a.mcap"],
             (
