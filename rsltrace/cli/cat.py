@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import chain, islice
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy.typing as npt
 
 from rsltrace.cli.output.event_json import EventJson
 from rsltrace.errors import TraceError, near_or_all
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.terminal import line_writer
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind

@@ -13,10 +13,11 @@ import os
 import re
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from rsltrace.diff.facts.remarks import JobChanged, NoRecordCommand, Remark
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.reader import Trace
 
 _EFFECTIVE = "# The effective job "
