@@ -16,7 +16,6 @@ import numpy.typing as npt
 from rsltrace.cli.output.event_json import EventJson
 from rsltrace.errors import TraceError, near_or_all
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.terminal import line_writer
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, EventRecord, Output, OutputKind
@@ -98,6 +97,7 @@ def _hex(value: int) -> str:
 
 if TYPE_CHECKING:
     from rsltrace.conditions.trace_events import TraceCondition
+    from rsltrace.job.values.times import TimeInRun
 
     _TimeParam = click.ParamType[TimeInRun]
 else:
@@ -113,6 +113,8 @@ class RunTimeParam(_TimeParam):
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> TimeInRun:
         """Return the time, or end with a usage error."""
+        from rsltrace.job.values.times import TimeInRun, parse_time_in_run
+
         if isinstance(value, TimeInRun):
             return value
         try:
