@@ -1,14 +1,18 @@
-"""``dataclass(frozen=True, slots=True)`` in a fifth of the time: a command makes a hundred of them.
+"""``dataclass(frozen=True, slots=True)`` in a tenth of the time: a command makes a hundred of them.
 
-Python's compiles seven functions for each class; here all but ``__init__`` are shared. Making an
-object takes longer, so classes of events and messages are Python's. Type checkers see Python's.
+Python's compiles seven functions for each class. Here one ``__init__`` is compiled for each number
+of fields and copied with their names, and the rest is shared. What ``dataclasses.fields`` tells is
+made when it is asked for. Comparing objects takes longer, so classes of events and messages are
+Python's. Type checkers see Python's.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import cache, partial
 from operator import attrgetter
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -19,18 +23,98 @@ else:
         """Return a class or a decorator of classes, as Python's does."""
         if options != {"frozen": True, "slots": True}:
             return dataclasses.dataclass(cls, **options)
-        made = dataclasses.dataclass(eq=False, repr=False, slots=True)
+        return _decorate
 
-        def decorate(cls):
-            cls = made(cls)
-            compared = [field.name for field in dataclasses.fields(cls) if field.compare]
-            cls._compared = _values(compared)
-            for name, shared in _SHARED.items():
-                if name not in vars(cls):
-                    setattr(cls, name, shared)
-            return cls
 
-        return decorate
+_slotted = dataclasses.dataclass(eq=False, repr=False, slots=True)
+_assign = object.__setattr__
+_NO_DEFAULT = object()
+
+
+def _decorate(cls: Any) -> Any:
+    body = {k: v for k, v in vars(cls).items() if k not in ("__dict__", "__weakref__")}
+    inherited = getattr(cls, "_plain_fields", None) or {}
+    fields = _plain_fields(cls, body)
+    if fields is None:
+        made = _slotted(cls)
+        compared = [field.name for field in dataclasses.fields(made) if field.compare]
+    else:
+        compared = [*fields]
+        init = _init(tuple(fields), tuple(v for v in fields.values() if v is not _NO_DEFAULT))
+        init.__qualname__ = f"{cls.__qualname__}.__init__"
+        own = {
+            "__slots__": [name for name in fields if name not in inherited],
+            "__init__": init,
+            "__match_args__": tuple(fields),
+            "__dataclass_fields__": _Description(
+                partial(cls.__class__, cls.__name__, cls.__bases__, body)
+            ),
+        }
+        kept = {k: v for k, v in body.items() if k not in fields}
+        made = cls.__class__(cls.__name__, cls.__bases__, own | kept)
+        made.__qualname__ = cls.__qualname__
+    for name, value in _SHARED.items():
+        if name not in vars(made):
+            setattr(made, name, value)
+    made._plain_fields = fields
+    made._compared = _values(compared)
+    return made
+
+
+def _plain_fields(cls: Any, body: dict[str, Any]) -> dict[str, object] | None:
+    """Return the fields and their defaults, or None if there is more to them."""
+    fields: dict[str, object] | None = getattr(cls, "_plain_fields", None)
+    if fields is None:
+        fields = {}
+        if hasattr(cls, "__dataclass_fields__"):
+            return None
+    annotations = cls.__annotations__
+    fields = fields | {name: body.get(name, _NO_DEFAULT) for name in annotations}
+    defaults = [value is not _NO_DEFAULT for value in fields.values()]
+    if (
+        sorted(defaults) != defaults
+        or hasattr(cls, "__post_init__")
+        or any(isinstance(v, dataclasses.Field) or v.__hash__ is None for v in fields.values())
+        or any("ClassVar" in str(text) for text in annotations.values())
+    ):
+        return None
+    return fields
+
+
+class _Description:
+    """What Python's dataclass tells of a class, made when it is asked for."""
+
+    def __init__(self, plain: Callable[[], type]) -> None:
+        self._plain = plain
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._owner = owner
+
+    def __get__(self, instance: object, cls: type) -> Any:
+        made: Any = _slotted(self._plain())
+        self._owner.__dataclass_params__ = made.__dataclass_params__  # type: ignore[attr-defined]
+        self._owner.__dataclass_fields__ = made.__dataclass_fields__  # type: ignore[attr-defined]
+        return made.__dataclass_fields__
+
+
+def _init(names: tuple[str, ...], defaults: tuple[object, ...]) -> FunctionType:
+    """Return an ``__init__`` that sets the attributes of these names."""
+    code = _template(len(names)).__code__
+    given = {f"_{place}": name for place, name in enumerate(names)}
+    code = code.replace(
+        co_varnames=("self", *names),
+        co_consts=tuple(given.get(constant, constant) for constant in code.co_consts),
+    )
+    return FunctionType(code, globals(), "__init__", defaults)
+
+
+@cache
+def _template(count: int) -> FunctionType:
+    names = [f"_{place}" for place in range(count)]
+    lines = [f"    _assign(self, {name!r}, {name})" for name in names]
+    made: dict[str, FunctionType] = {}
+    exec("\n".join([f"def __init__({', '.join(['self', *names])}):", *lines, "    pass"]), made)
+    return made["__init__"]
 
 
 def _values(names: list[str]) -> Callable[[Any], Any]:

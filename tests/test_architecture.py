@@ -310,6 +310,7 @@ RUNS_CODE = {
     # Between processes of one command, on a socket or pipe that nobody else has.
     "rsltrace/native/processes/wire.py": "pickle",  # of user code: plain values only
     "rsltrace/run/forked.py": "pickle",  # what a copy of the simulation returns
+    "rsltrace/fast_dataclass.py": "exec",  # a function of so many arguments, its text our own
     # Who sits at the prompt of a session, in a run whose code they have agreed to run.
     "rsltrace/debug/inspection.py": "compile eval",
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import chain, islice
 from pathlib import Path
@@ -15,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.cli.output.event_json import EventJson
-from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import TraceError, near_or_all
-from rsltrace.job.values.times import TimeInRun, parse_time_in_run
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.terminal import line_writer
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, EventRecord, Output, OutputKind
@@ -98,6 +96,9 @@ def _hex(value: int) -> str:
 
 
 if TYPE_CHECKING:
+    from rsltrace.conditions.trace_events import TraceCondition
+    from rsltrace.job.values.times import TimeInRun
+
     _TimeParam = click.ParamType[TimeInRun]
 else:
     _TimeParam = click.ParamType  # not generic before click 8.2
@@ -112,6 +113,8 @@ class RunTimeParam(_TimeParam):
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> TimeInRun:
         """Return the time, or end with a usage error."""
+        from rsltrace.job.values.times import TimeInRun, parse_time_in_run
+
         if isinstance(value, TimeInRun):
             return value
         try:
@@ -197,12 +200,18 @@ def cat(
         raise click.UsageError("--payloads needs --json")
     with Trace.open(trace) as opened:
         choice = _choice(opened, topics, nodes, entities, kinds, first, last)
-        condition = None if where is None else TraceCondition(where, opened)
+        condition = None if where is None else _condition(where, opened)
         events = _events(opened, choice, condition)
         write = line_writer()
         form = _json_form(opened, payloads) if as_json else EventLines(opened, code=code).line
         for event, outputs in islice(events, limit):
             write(form(event, outputs))
+
+
+def _condition(text: str, trace: Trace) -> TraceCondition:
+    from rsltrace.conditions.trace_events import TraceCondition
+
+    return TraceCondition(text, trace)
 
 
 def _json_form(trace: Trace, payloads: bool) -> Callable[[EventRecord, list[Output]], str]:

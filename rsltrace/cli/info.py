@@ -14,7 +14,6 @@ from typing import Any, TypeAlias
 import click
 
 from rsltrace.cli.output.text_file import write_text
-from rsltrace.replay.edits import edits_of
 from rsltrace.terminal import say
 from rsltrace.trace.contents import TraceCounts, count_trace
 from rsltrace.trace.exports.output_file import check_not_input
@@ -231,7 +230,7 @@ def _as_text(trace: Trace, counts: TraceCounts, *, show_all: bool) -> list[str]:
             lines += ["", title, *table(rows)]
     if is_native(trace):
         lines += native_lines(trace)
-    if edits := edits_of(trace):
+    if edits := trace.edits:
         lines += ["", "edits of this branch", *(f"  {printable(e)}" for e in edits)]
     lines += _guard_lines(trace)
     lines += _drop_lines(trace)
@@ -358,7 +357,7 @@ def _as_json(trace: Trace, counts: TraceCounts) -> dict[str, Any]:
         "output_kinds": _counts_by_kind(counts.output_kinds, OutputKind),
         "result": trace.result,
         "job": trace.job,
-        "edits": list(edits_of(trace)),
+        "edits": list(trace.edits),
         "environment": trace.environment,
         "guard": [
             {

@@ -22,7 +22,6 @@ from typing import Any
 from rsltrace.errors import EditError, did_you_mean
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.times import TimeInRun, parse_stamp, parse_time_in_run
-from rsltrace.trace.format import METADATA_EDITS
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
 
@@ -118,13 +117,6 @@ def parse_edit(text: str) -> Edit:
     :raises EditError: with the position in the text.
     """
     return _EditParser(text).edit()
-
-
-def edits_of(trace: Trace) -> tuple[str, ...]:
-    """Return the edits of a branch; none of any other trace."""
-    return tuple(
-        text for key, text in sorted(trace.metadata(METADATA_EDITS).items()) if key != "of"
-    )
 
 
 def edits_metadata(edits: Iterable[Edit], trace: Trace) -> dict[str, str]:

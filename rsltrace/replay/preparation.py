@@ -18,7 +18,7 @@ from rsltrace.job.fields import COMMAND_LINE
 from rsltrace.job.parts.scheduling import PolicySpec
 from rsltrace.job.reading.resolved import job_from_resolved
 from rsltrace.replay.code import JobCodeFile, job_code_files, module_file
-from rsltrace.replay.edits import Edit, edits_of, parse_edit
+from rsltrace.replay.edits import Edit, parse_edit
 from rsltrace.run.inputs import expand_launch_files
 from rsltrace.run.plans.recorded_order import last_ns
 from rsltrace.run.provenance import environment
@@ -201,7 +201,7 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
     differing = _differing(own, job)
     if differing:
         return f"its job differs from {folder / name} in {', '.join(differing)}"
-    if edits_of(trace):
+    if trace.edits:
         return "it holds edits, which the nodes would run with"
     if any(found.mode is GuardMode.RECORD for one in trace.findings.values() for found in one):
         return "it holds recorded answers (of files, sockets, …) that the nodes would get"
@@ -320,7 +320,7 @@ def prepare_replay(
             tuple(_changes(trace)),
             distrust,
             tuple(_notes(trace)),
-            tuple(map(parse_edit, edits_of(trace))),
+            tuple(map(parse_edit, trace.edits)),
         )
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rsltrace.replay.edits import edits_of
 from rsltrace.simulation.loop.stop import Stop, StopCondition, stop_at
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.format import REPLAY_DIVERGED
@@ -153,7 +152,7 @@ def limit_of(trace: Trace, until: int | None) -> tuple[int, Stop | None]:
     count, found = trace.event_count, []
     if until is not None and until < count:
         found.append((until, Stop("as far as asked for")))
-    outside = None if edits_of(trace) else _first_outside(trace, until)  # else they are edits
+    outside = None if trace.edits else _first_outside(trace, until)  # else they are edits
     if outside is not None:
         why = f"event {outside} was done by {_BY_DRIVER}, and no trace says how to do it again"
         found.append((outside, Stop(why)))

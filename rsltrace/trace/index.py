@@ -6,7 +6,7 @@ An interrupted trace has no summary; ``scan`` makes the same index by walking th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import accumulate, chain
 from struct import unpack
 from typing import ClassVar, NamedTuple
@@ -15,6 +15,7 @@ import xxhash
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError, TraceFormatError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
     CHECKSUM_KEY,

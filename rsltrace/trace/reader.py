@@ -21,6 +21,7 @@ from rsltrace.trace.cdr import unpack_code_line, unpack_detail, unpack_entity, u
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
+    METADATA_EDITS,
     METADATA_ENVIRONMENT,
     METADATA_GUARD,
     METADATA_JOB,
@@ -265,6 +266,12 @@ class Trace:
     def job(self) -> dict[str, str]:
         """The requested job: the metadata ``rsltrace:job``."""
         return self.metadata(METADATA_JOB)
+
+    @property
+    def edits(self) -> tuple[str, ...]:
+        """The texts of a branch's edits (the metadata ``rsltrace:edits``); none of other traces."""
+        texts = sorted(self.metadata(METADATA_EDITS).items())
+        return tuple(text for key, text in texts if key != "of")
 
     @cached_property
     def job_text(self) -> str:

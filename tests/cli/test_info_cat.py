@@ -459,8 +459,20 @@ _HEAVY = (
     [
         (["--help"], _HEAVY),
         (["--version"], _HEAVY),
-        (["info", "a.mcap"], ("rsltrace.diff", "rsltrace.conditions", "rsltrace.trace.decode")),
-        (["cat", "a.mcap"], ("rsltrace.diff", "rsltrace.replay", "rsltrace.trace.decode")),
+        (
+            ["info", "a.mcap"],
+            (
+                *("rsltrace.diff", "rsltrace.conditions", "rsltrace.trace.decode"),
+                *("rsltrace.replay", "rsltrace.job"),
+            ),
+        ),
+        (
+            ["cat", "a.mcap"],
+            (
+                *("rsltrace.diff", "rsltrace.replay", "rsltrace.trace.decode"),
+                *("rsltrace.conditions", "rsltrace.job"),
+            ),
+        ),
         (
             ["diff", "a.mcap", "a.mcap"],
             (

@@ -6,11 +6,13 @@ import copy
 import dataclasses
 import gc
 import importlib.metadata
+import inspect
 import pickle
 import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -92,6 +94,50 @@ def test_a_quick_dataclass_is_one_of_pythons() -> None:
         assert (
             pickle.loads(pickle.dumps(Kept(1, (2,)))) == Kept(1, (2,)) == copy.copy(Kept(1, (2,)))
         )
+
+
+@pytest.mark.parametrize("given", [(), (1,), (1, 2), (1, 2, 3, 4, 5), {"a": 1, "c": 2, "b": 3}])
+def test_a_quick_dataclass_inherits_fields_as_pythons_does(given: Any) -> None:
+    def family(decorate: Any) -> list[Any]:
+        @decorate(frozen=True, slots=True)
+        class Base:
+            a: int
+            b: int
+
+            def total(self) -> int:
+                return self.a + self.b
+
+        @decorate(frozen=True, slots=True)
+        class Derived(Base):
+            """What it is."""
+
+            c: int = 7
+            a: str
+
+        @decorate(frozen=True, slots=True)
+        class Empty(Derived):
+            pass
+
+        return [Base, Derived, Empty]
+
+    def told(cls: Any) -> Any:
+        words = given if isinstance(given, dict) else {}
+        try:
+            made = cls(*(() if words else given), **words)
+        except TypeError as error:
+            return str(error)
+        fields = [(f.name, f.type, f.default) for f in dataclasses.fields(made)]
+        changed = dataclasses.replace(made, b=9)
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            made.a = 3
+        same = (made == cls(**dataclasses.asdict(made)), made == changed, len({made, changed}))
+        return (repr(made), repr(changed), fields, same, made.total(), cls.__match_args__)
+
+    quick, own = family(fast_dataclass.dataclass), family(dataclasses.dataclass)
+    for one, other in zip(quick, own, strict=True):
+        assert told(one) == told(other)
+        assert one.__slots__ == list(other.__slots__)
+        assert list(inspect.signature(one).parameters) == list(inspect.signature(other).parameters)
 
 
 def test_versions_are_those_of_the_packages_metadata() -> None:

@@ -11,9 +11,10 @@ import itertools
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from rsltrace.diff.alignment.rows import EventColumns
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.event import NO_EVENT
 
 # Matching two sequences of events of one entity: from the surest sign to the weakest.

@@ -14,14 +14,13 @@ Rejected: one row per matched pair, in the order of a. It cannot show the order 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EqualBlock, EventPair
 from rsltrace.diff.alignment.rows import longest_increasing
 from rsltrace.diff.row_sign import RowSign
+from rsltrace.fast_dataclass import dataclass
 
 Ints = npt.NDArray[np.int64]
 _NONE = -1

@@ -6,7 +6,7 @@ The first rule in ``_judge`` that applies wins.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 from rsltrace.diff.causes.propagation import NODE
 from rsltrace.diff.causes.relevance import DivergenceSite, Relevance
@@ -45,6 +45,7 @@ from rsltrace.diff.facts.evidence import (
     StateDifference,
     node_of,
 )
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind, is_switch
 from rsltrace.trace.model.operation import PARAMETER_EVENTS

@@ -12,7 +12,6 @@ import difflib
 import json
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from typing import Any
 from rsltrace.diff.causes.record_command import is_effective, is_of_file, job_file
 from rsltrace.diff.causes.relevance import resolved_job
 from rsltrace.diff.facts.evidence import Setting, SettingKind
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.operation import nested_too_deep
 from rsltrace.trace.model.texts import contrasting, format_duration
 from rsltrace.trace.reader import Trace

@@ -13,10 +13,11 @@ import os
 import re
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from rsltrace.diff.facts.remarks import JobChanged, NoRecordCommand, Remark
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.reader import Trace
 
 _EFFECTIVE = "# The effective job "
@@ -37,30 +38,25 @@ _WORD = r"[A-Za-z_]\w*"
 _KEY = r"[\w/~*-]+"
 
 
-def _of_values(leaf: str) -> re.Pattern[str]:
-    """Return what fits a leaf, or a list or a mapping of such."""
+def _of_values(leaf: str) -> str:
+    """Return the pattern of a leaf, or a list or a mapping of such."""
     leaf = rf"(?:{leaf}|\"(?:{leaf})\")"
     pair = rf"{_KEY}: {leaf}"
     items, pairs = (rf"(?:{one}(?:, ?{one})*)?" for one in (leaf, pair))
-    return re.compile(rf"{leaf}|\[{items}\]|\{{{pairs}\}}", re.ASCII)
+    return rf"{leaf}|\[{items}\]|\{{{pairs}\}}"
 
 
 _NUMBERS = _of_values(_NUMBER)
 _NUMBERS_AND_WORDS = _of_values(f"{_NUMBER}|{_WORD}")
 _NUMBERS_AND_NAMES = _of_values(f"{_NUMBER}|{_NAME}")
-_SETTINGS: tuple[tuple[re.Pattern[str], re.Pattern[str]], ...] = tuple(
-    (re.compile(key, re.ASCII), values)
-    for key, values in (
-        (r"seed|min_time_step", _NUMBERS),
-        (rf"(?:delay|execution|clocks)(?:\.{_KEY})*", _NUMBERS),
-        (
-            rf"nodes\.{_KEY}\.(?:parameters|arguments)(?:\.{_KEY})+",
-            _NUMBERS_AND_WORDS,
-        ),
-        (rf"(?:stop|record|policy)(?:\.{_KEY})*", _NUMBERS_AND_NAMES),
-    )
+_SETTINGS = (
+    (r"seed|min_time_step", _NUMBERS),
+    (rf"(?:delay|execution|clocks)(?:\.{_KEY})*", _NUMBERS),
+    (rf"nodes\.{_KEY}\.(?:parameters|arguments)(?:\.{_KEY})+", _NUMBERS_AND_WORDS),
+    (rf"(?:stop|record|policy)(?:\.{_KEY})*", _NUMBERS_AND_NAMES),
 )
-"""Keys that ``--set`` is offered for, and their values: nothing here names code or a file."""
+"""Keys that ``--set`` is offered for, and their values: nothing here names code or a file. Few
+traces have such settings, and compiling the patterns takes milliseconds."""
 
 _ARGUMENT = re.compile(rf"({_KEY}):=({_NUMBER}|{_NAME})", re.ASCII)
 _REMAPPING = re.compile(r"[\w/~:]+:=[\w/~]+", re.ASCII)
@@ -120,7 +116,9 @@ def options_of(trace: Trace) -> Iterator[tuple[str, str]]:
 def is_harmless(change: str) -> bool:
     """Whether ``key=value`` of a trace names neither code nor a file."""
     key, _, value = change.partition("=")
-    fits = (k.fullmatch(key) and v.fullmatch(value) for k, v in _SETTINGS)
+    fits = (
+        re.fullmatch(k, key, re.ASCII) and re.fullmatch(v, value, re.ASCII) for k, v in _SETTINGS
+    )
     return len(change) <= _CHANGE_MAX and any(fits)
 
 

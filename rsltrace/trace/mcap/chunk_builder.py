@@ -8,13 +8,13 @@ indexes: messages of one size as one structured array, others joined with header
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.mcap.records import RECORD_HEAD
 
 MESSAGE_HEADER_DTYPE = np.dtype(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.texts import printable
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from textual import events
 from textual.app import ComposeResult
@@ -13,6 +12,7 @@ from textual.message import Message
 from textual.suggester import Suggester
 from textual.widgets import Input, Static
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.view import cells
 
