@@ -87,7 +87,7 @@ def compile_core(made: Path) -> str:
 def main() -> None:
     """Build in place what is out of date."""
     made = _FOLDER / Path(_MODULE).name
-    newest = max(source.stat().st_mtime for source in _SOURCES)
+    newest = max(source.stat().st_mtime for source in _FOLDER.glob("_*.[ch]"))
     if not made.exists() or made.stat().st_mtime < newest:
         problem = compile_core(made)
         if problem:

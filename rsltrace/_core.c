@@ -3,18 +3,7 @@
    same bytes. What is unusual (a number that does not fit, an index of numpy, a link, a watched
    topic, a coroutine, a busy callback group) is left to Python. */
 
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030A0000
-#include <Python.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
-#include <structmember.h>
-
-/* Headers from 3.12 on do not count this reference: it would be lost in older versions, for which the
-   module is built, too. */
-#undef Py_RETURN_NONE
-#define Py_RETURN_NONE return Py_NewRef(Py_None)
+#include "_core.h"
 
 #if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "rows are packed as they lie in memory"
@@ -616,98 +605,20 @@ static PyType_Spec chain_spec = {
 
 /* -- fields ------------------------------------------------------------------------------------- */
 
-/* Base classes of Python's: what is read below lies in a struct, where Python reads and writes it
-   like a slot. A field is NULL until it is set. They have object's __new__, the only one that lets
-   Python 3.11 keep the other attributes without a dict. */
-
-typedef struct {
-  PyObject_HEAD
-  PyObject *now_ns, *events, *activity_ns, *ready;
-} Loop;
-
-typedef struct {
-  PyObject_HEAD
-  PyObject *handle, *entity, *node, *kind, *cause_event, *cause_output, *input_hash;
-  PyObject *flags, *quiet, *on_end;
-} Event;
-
-typedef struct {
-  PyObject_HEAD
-  PyObject *loop, *event, *entities, *recorder, *unrecorded, *pending, *before, *after;
-} Dispatcher;
-
-typedef struct {
-  PyObject_HEAD
-  /* Not every entity has all of these. */
-  PyObject *active, *state, *queue, *keep;
-  PyObject *node, *destroyed, *wrapper, *own_group, *mailbox;
-  PyObject *callback, *coroutine, *with_info, *deserialize, *serialize, *sites;
-  PyObject *dispatcher, *entity_id; /* from here on what a publisher has */
-  PyObject *subscriptions, *links, *observers, *count, *channel, *history, *offers;
-} Entity;
-
-typedef struct {
-  PyObject_HEAD
-  PyObject *due, *running;
-} Sites;
-
-static PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type, *sites_type;
-static PyTypeObject *chain_type;
+PyTypeObject *event_type, *dispatcher_type, *entity_type;
+PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen; /* subclasses: see is_a */
+static PyTypeObject *sites_type, *chain_type;
+static PyObject *sites_seen, *publisher_seen, *node_seen, *chain_seen;
 static PyObject *deque_type, *deque_append, *deque_popleft, *hash64, *zero, *output_kind;
 static PyObject *call_back;
-static PyObject *loop_seen, *event_seen, *dispatcher_seen, *sites_seen; /* subclasses: see is_a */
-static PyObject *publisher_seen, *subscription_seen, *node_seen, *chain_seen;
 static PyObject *callback_group, *active_entity, *user_callback, *raw;
 
-#define FIELD_COUNT(Struct) ((sizeof(Struct) - sizeof(PyObject)) / sizeof(PyObject *))
-
-#define FIELDS(Struct, prefix)                                                       \
-  static int prefix##_traverse(PyObject *self, visitproc visit, void *arg) {         \
-    Py_VISIT(Py_TYPE(self));                                                         \
-    for (size_t i = 0; i < FIELD_COUNT(Struct); ++i)                                 \
-      Py_VISIT(((PyObject **)(self + 1))[i]);                                        \
-    return 0;                                                                        \
-  }                                                                                  \
-  static int prefix##_clear(PyObject *self) {                                        \
-    for (size_t i = 0; i < FIELD_COUNT(Struct); ++i)                                 \
-      Py_CLEAR(((PyObject **)(self + 1))[i]);                                        \
-    return 0;                                                                        \
-  }                                                                                  \
-  static void prefix##_dealloc(PyObject *self) {                                     \
-    PyTypeObject *type = Py_TYPE(self);                                              \
-    PyObject_GC_UnTrack(self);                                                       \
-    prefix##_clear(self);                                                            \
-    PyObject_GC_Del(self);                                                           \
-    Py_DECREF(type);                                                                 \
-  }                                                                                  \
-  static PyTypeObject *prefix##_made(PyMemberDef *fields,  PyMethodDef *methods) {   \
-    PyType_Slot slots[] = {                                                          \
-        {Py_tp_dealloc, prefix##_dealloc}, {Py_tp_traverse, prefix##_traverse},      \
-        {Py_tp_clear, prefix##_clear},     {Py_tp_members, fields},                  \
-        {Py_tp_methods, methods},          {0, NULL},                                \
-    };                                                                               \
-    PyType_Spec spec = {                                                             \
-        "rsltrace._core." #Struct "Fields", sizeof(Struct), 0,                       \
-        Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, slots,        \
-    };                                                                               \
-    return (PyTypeObject *)PyType_FromSpec(&spec);                                   \
-  }
-
-FIELDS(Loop, loop)
 FIELDS(Event, event)
 FIELDS(Dispatcher, dispatcher)
 FIELDS(Entity, entity)
 FIELDS(Sites, sites)
 
-#define FIELD(Struct, field, name) {name, T_OBJECT_EX, offsetof(Struct, field), 0, NULL}
-#define NO_FIELD {NULL, 0, 0, 0, NULL}
-
-static PyMemberDef loop_fields[] = {
-    FIELD(Loop, now_ns, "now_ns"), FIELD(Loop, events, "events"),
-    FIELD(Loop, activity_ns, "activity_ns"), FIELD(Loop, ready, "ready"), NO_FIELD,
-};
-
-static PyMemberDef event_fields[] = {
+PyMemberDef event_fields[] = {
     FIELD(Event, handle, "handle"),
     FIELD(Event, entity, "entity"),
     FIELD(Event, node, "node"),
@@ -717,6 +628,7 @@ static PyMemberDef event_fields[] = {
     FIELD(Event, input_hash, "input_hash"),
     FIELD(Event, flags, "flags"),
     FIELD(Event, quiet, "quiet"),
+    FIELD(Event, busy_ns, "busy_ns"),
     FIELD(Event, on_end, "on_end"),
     NO_FIELD,
 };
@@ -725,7 +637,7 @@ static PyMemberDef sites_fields[] = {
     FIELD(Sites, due, "due"), FIELD(Sites, running, "running"), NO_FIELD,
 };
 
-static PyMemberDef dispatcher_fields[] = {
+PyMemberDef dispatcher_fields[] = {
     FIELD(Dispatcher, loop, "loop"),
     FIELD(Dispatcher, event, "event"),
     FIELD(Dispatcher, entities, "entities"),
@@ -737,7 +649,7 @@ static PyMemberDef dispatcher_fields[] = {
     NO_FIELD,
 };
 
-static PyMemberDef entity_fields[] = {
+PyMemberDef entity_fields[] = {
     FIELD(Entity, active, "active"),
     FIELD(Entity, state, "state"),
     FIELD(Entity, queue, "queue"),
@@ -762,21 +674,11 @@ static PyMemberDef entity_fields[] = {
     FIELD(Entity, channel, "_channel"),
     FIELD(Entity, history, "_history"),
     FIELD(Entity, offers, "_offers"),
+    FIELD(Entity, faults, "_faults"),
     NO_FIELD,
 };
 
-/* Whether an object is of a class of ours. ``seen`` is the last of its subclasses that was found to
-   be one: to look for a base class takes long. */
-static inline int is_a(PyObject *object, PyTypeObject *type, PyObject **seen) {
-  PyObject *own = (PyObject *)Py_TYPE(object), *old = *seen;
-  if (own == old) return 1;
-  if (!PyType_IsSubtype((PyTypeObject *)own, type)) return 0;
-  *seen = Py_NewRef(own);
-  Py_XDECREF(old);
-  return 1;
-}
-
-static void refuse(PyObject *object, PyTypeObject *type, const PyMemberDef *fields, size_t first) {
+void refuse(PyObject *object, PyTypeObject *type, const PyMemberDef *fields, size_t first) {
   if (object == NULL || !PyObject_TypeCheck(object, type)) {
     PyErr_SetString(PyExc_TypeError, "a part of the run is missing, or of another class");
     return;
@@ -785,30 +687,13 @@ static void refuse(PyObject *object, PyTypeObject *type, const PyMemberDef *fiel
   PyErr_SetString(PyExc_AttributeError, fields[first].name);
 }
 
-/* Whether an object has the fields of a struct, all set from ``first`` on; else sets an error. It is
-   asked more often than anything else: let the compiler write it out. */
-static inline __attribute__((always_inline)) int has_fields(
-    PyObject *object, PyTypeObject *type, PyObject **seen, const PyMemberDef *fields,
-    size_t first, size_t count) {
-  int has = object != NULL && is_a(object, type, seen);
-#pragma GCC unroll 16
-  for (size_t i = first; i < count; ++i) has = has && ((PyObject **)(object + 1))[i] != NULL;
-  if (!has) refuse(object, type, fields, first);
-  return has;
-}
-
-#define HAS_FIELDS(object, Struct, prefix) \
-  has_fields((PyObject *)(object), prefix##_type, &prefix##_seen, prefix##_fields, 0, \
-             FIELD_COUNT(Struct))
-
 static int is_publisher(PyObject *object) {
   const size_t first = (offsetof(Entity, dispatcher) - sizeof(PyObject)) / sizeof(PyObject *);
   return has_fields(object, entity_type, &publisher_seen, entity_fields, first,
                     FIELD_COUNT(Entity));
 }
 
-/* Replaces a field by a new object, or fails if there is none. */
-static int set(PyObject **field, PyObject *value) {
+int set(PyObject **field, PyObject *value) {
   PyObject *old = *field;
   if (value == NULL) return -1;
   *field = value;
@@ -822,7 +707,7 @@ static int add_one(PyObject **field) {
   return set(field, PyLong_FromUnsignedLongLong(value + 1));
 }
 
-static int done(PyObject *result) {
+int done(PyObject *result) {
   Py_XDECREF(result);
   return result == NULL ? -1 : 0;
 }
@@ -862,6 +747,12 @@ static int record_end(Dispatcher *self, PyObject *recorder, Loop *loop, Event *e
   for (int i = 0; i < 8; ++i) Py_DECREF(row[i]);
   Py_DECREF(recorder);
   return done(result);
+}
+
+int record_draw(PyObject *recorder, PyObject *entity, PyObject *draw) {
+  PyObject *row[] = {entity, draw};
+  if (is_a(recorder, chain_type, &chain_seen)) return done(chain_draw((Chain *)recorder, row, 2));
+  return done(PyObject_CallMethod(recorder, "draw", "OO", entity, draw));
 }
 
 static int settle_entities(Dispatcher *self) {
@@ -970,7 +861,7 @@ static PyMethodDef dispatcher_methods[] = {
 
 /* -- Publisher ---------------------------------------------------------------------------------- */
 
-static int append_to(PyObject *queue, PyObject *item) {
+int append_to(PyObject *queue, PyObject *item) {
   if ((PyObject *)Py_TYPE(queue) == deque_type)
     return done(PyObject_CallFunctionObjArgs(deque_append, queue, item, NULL));
   return done(PyObject_CallMethod(queue, "append", "(O)", item));
@@ -985,18 +876,17 @@ static int is_full(PyObject *queue, PyObject *keep) {
   return count < 0 || (most == -1 && PyErr_Occurred()) ? -1 : count == most;
 }
 
-static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
-  Entity *to = (Entity *)subscription;
+int queue_arrival(PyObject *receiver, PyObject *arrival) {
+  Entity *to = (Entity *)receiver;
   int is_it;
-  if (!is_a(subscription, entity_type, &subscription_seen) || to->queue == NULL ||
-      to->keep == NULL || to->active == NULL) {
+  if (!is_a(receiver, entity_type, &subscription_seen) || to->queue == NULL || to->keep == NULL) {
     PyErr_SetString(PyExc_TypeError, "a subscription has no queue");
     return -1;
   }
   PyObject *queue = Py_NewRef(to->queue), *keep = Py_NewRef(to->keep);
   is_it = is_full(queue, keep);
-  const int failed = is_it < 0 || (is_it && call_method(subscription, "drop") < 0) ||
-                     append_to(queue, delivery) < 0 || !HAS_FIELDS(loop, Loop, loop);
+  const int failed = is_it < 0 || (is_it && call_method(receiver, "drop") < 0) ||
+                     append_to(queue, arrival) < 0;
   Py_DECREF(keep);
   Py_DECREF(queue);
   if (failed) return -1;
@@ -1004,9 +894,16 @@ static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
     PyErr_SetString(PyExc_TypeError, "a subscription has lost its fields");
     return -1;
   }
-  is_it = PyObject_IsTrue(to->active);
-  if (is_it <= 0) return is_it < 0 ? -1 : call_method(subscription, "awaken");
-  return append_to(loop->ready, subscription);
+  PyObject *active = Py_NewRef(to->active);
+  is_it = PyObject_IsTrue(active);
+  Py_DECREF(active);
+  return is_it ? is_it : call_method(receiver, "awaken");
+}
+
+static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
+  const int is_ready = queue_arrival(subscription, delivery);
+  if (is_ready <= 0) return is_ready;
+  return HAS_FIELDS(loop, Loop, loop) ? append_to(loop->ready, subscription) : -1;
 }
 
 static int deliver_to_all(Entity *self, PyObject *delivery, Loop *loop) {
@@ -1016,6 +913,18 @@ static int deliver_to_all(Entity *self, PyObject *delivery, Loop *loop) {
     PyObject *subscription = Py_NewRef(PyList_GetItem(all, i));
     failed = deliver(subscription, delivery, loop);
     Py_DECREF(subscription);
+  }
+  Py_DECREF(all);
+  return failed;
+}
+
+static int send_over_links(Entity *self, PyObject *delivery) {
+  PyObject *all = Py_NewRef(self->links);
+  int failed = 0;
+  for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
+    PyObject *link = Py_NewRef(PyList_GetItem(all, i));
+    failed = send_over(link, delivery) < 0;
+    Py_DECREF(link);
   }
   Py_DECREF(all);
   return failed;
@@ -1074,7 +983,8 @@ static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
   if (!failed) {
     delivery = delivery_of(loop, now_ns, data, digest, position, self->count);
     failed = delivery == NULL || set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 ||
-             deliver_to_all(self, delivery, loop) < 0;
+             (self->links == Py_None ? deliver_to_all(self, delivery, loop)
+                                     : send_over_links(self, delivery)) < 0;
   }
   Py_XDECREF(now_ns);
   Py_XDECREF(delivery);
@@ -1095,8 +1005,9 @@ static PyObject *publisher_send(Entity *self, PyObject *const *args, Py_ssize_t 
   if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) return NULL;
   content_hash = count > 1 ? args[1] : Py_None;
   recorder = dispatcher->recorder;
-  if (self->observers != Py_None || self->links != Py_None || self->history != Py_None ||
-      self->offers != Py_None || !PyList_Check(self->subscriptions) ||
+  if (self->observers != Py_None || self->history != Py_None || self->offers != Py_None ||
+      self->faults != Py_None || !PyList_Check(self->subscriptions) ||
+      (self->links != Py_None && !PyList_Check(self->links)) ||
       (recorder != Py_None &&
        (self->channel == Py_None || !is_a(recorder, chain_type, &chain_seen))))
     return PyObject_CallMethod((PyObject *)self, "send_any", "OO", args[0], content_hash);
@@ -1259,7 +1170,6 @@ static int add_types(PyObject *module) {
   no_sequence = PyLong_FromUnsignedLong(U32);
   buffer_type = (PyTypeObject *)PyType_FromSpec(&buffer_spec);
   chain_type = (PyTypeObject *)PyType_FromSpec(&chain_spec);
-  loop_type = loop_made(loop_fields, no_methods);
   event_type = event_made(event_fields, no_methods);
   dispatcher_type = dispatcher_made(dispatcher_fields, dispatcher_methods);
   entity_type = entity_made(entity_fields, no_methods);
@@ -1269,10 +1179,9 @@ static int add_types(PyObject *module) {
     PyObject *object;
   } all[] = {
       {"RecordBuffer", (PyObject *)buffer_type},   {"EventChain", (PyObject *)chain_type},
-      {"LoopFields", (PyObject *)loop_type},       {"EventFields", (PyObject *)event_type},
-      {"EventEnd", (PyObject *)dispatcher_type},   {"EntityFields", (PyObject *)entity_type},
+      {"EventFields", (PyObject *)event_type},     {"EventEnd", (PyObject *)dispatcher_type},
+      {"EntityFields", (PyObject *)entity_type},   {"SitesFields", (PyObject *)sites_type},
       {"PublisherFields", entity_with(publisher_methods, "rsltrace._core.PublisherFields")},
-      {"SitesFields", (PyObject *)sites_type},
       {"SubscriptionFields",
        entity_with(subscription_methods, "rsltrace._core.SubscriptionFields")},
   };
@@ -1291,10 +1200,9 @@ static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT, "_core", NULL, -1, NULL, NULL, NULL, NULL, NULL,
 };
 
-int add_message_plan(PyObject *module); /* of _cdr.c */
-
 PyMODINIT_FUNC PyInit__core(void) {
   PyObject *module = PyModule_Create(&definition);
-  if (module != NULL && (add_types(module) < 0 || add_message_plan(module) < 0)) Py_CLEAR(module);
+  if (module != NULL && (add_types(module) < 0 || add_loop_types(module) < 0 || add_message_plan(module) < 0))
+    Py_CLEAR(module);
   return module;
 }

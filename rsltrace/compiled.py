@@ -17,7 +17,9 @@ def _is_older_than_its_source(module: ModuleType) -> bool:
     """Return whether a checkout has got another source since it was built."""
     built_s = os.stat(str(module.__file__)).st_mtime
     with os.scandir(os.path.dirname(__file__)) as files:  # an installed package has no sources
-        return any(file.stat().st_mtime > built_s for file in files if file.name.endswith(".c"))
+        return any(
+            file.stat().st_mtime > built_s for file in files if file.name[-2:] in (".c", ".h")
+        )
 
 
 core: ModuleType | None = None
@@ -33,6 +35,7 @@ if os.environ.get("RSLTRACE_COMPILED") != "0":
 LoopFields = object
 EventFields = object
 EntityFields = object
+LinkFields = object
 PublisherFields = object
 SubscriptionFields = object
 SitesFields = object
@@ -40,3 +43,4 @@ if core is not None and not TYPE_CHECKING:
     LoopFields, EventFields = core.LoopFields, core.EventFields
     EntityFields, PublisherFields = core.EntityFields, core.PublisherFields
     SubscriptionFields, SitesFields = core.SubscriptionFields, core.SitesFields
+    LinkFields = core.LinkFields

@@ -168,7 +168,7 @@ class Steady(Node):
         self.log.append(("steady", message.data, name, decimal.getcontext().prec, sys.argv[:1]))
 
 
-def run(simulate: Any, seed: int, *, tame: bool) -> tuple[Any, ...]:
+def run(simulate: Any, seed: int, *, tame: bool, job: Any) -> tuple[Any, ...]:
     log: list[Any] = []
 
     def steady() -> Node:
@@ -176,7 +176,7 @@ def run(simulate: Any, seed: int, *, tame: bool) -> tuple[Any, ...]:
 
     specs = [NodeSpec(main=program(seed + at, log, tame), name=f"m{at}") for at in range(2)]
     try:
-        result = simulate(*specs, steady, duration=1, job={"seed": seed}).result
+        result = simulate(*specs, steady, duration=1, job={"seed": seed, **job}).result
     except Exception as error:
         return type(error), str(error), log
     return result.digest, result.events, result.notes, log
@@ -203,12 +203,14 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return count
 
 
-def compare(simulate: Any, monkeypatch: pytest.MonkeyPatch, seed: int, *, tame: bool) -> int:
+def compare(
+    simulate: Any, monkeypatch: pytest.MonkeyPatch, seed: int, *, tame: bool, **job: Any
+) -> int:
     """Run the same with and without standing by; return how much was logged."""
-    at_once = run(simulate, seed, tame=tame)
+    at_once = run(simulate, seed, tame=tame, job=job)
     with monkeypatch.context() as patch:
         patch.setattr(driver, "standby_of", lambda *_, **__: None)
-        usual = run(simulate, seed, tame=tame)
+        usual = run(simulate, seed, tame=tame, job=job)
     assert at_once == usual
     return len(at_once[-1])
 
@@ -226,6 +228,16 @@ def test_whatever_callbacks_do_the_run_is_the_same(
     simulate: Any, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
     assert compare(simulate, monkeypatch, seed, tame=False) > 100
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_it_is_the_same_with_delays(
+    simulate: Any, monkeypatch: pytest.MonkeyPatch, served: list[int], seed: int
+) -> None:
+    delay = {"default": {"uniform": {"min": "0us", "max": "2ms"}}}
+    logged = compare(simulate, monkeypatch, seed, tame=seed == 0, delay=delay)
+    assert logged > 50
+    assert served[0] > 20, f"{served} of {logged}"
 
 
 def test_mains_that_keep_each_other_going_are_stopped_where_they_ever_were(

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import traceback
 from collections import deque
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,14 +18,24 @@ from typing import Any
 import pytest
 
 from rsltrace.compiled import core
+from rsltrace.simulation.chance.channel import (
+    LinkModel,
+    LinkOutage,
+    NameRule,
+    NetworkPlan,
+    OutageRule,
+)
+from rsltrace.simulation.chance.distribution import Constant, Uniform
 from rsltrace.simulation.loop.loop import EventLoop
-from rsltrace.simulation.loop.timer_queue import timer_queue
+from rsltrace.simulation.loop.stop import Stop, stop_after_events, stop_at
+from rsltrace.simulation.loop.timer_queue import TimerState, timer_queue
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher, PythonEventEnd
 from rsltrace.simulation.middleware.events.observer import (
     EventCall,
     EventObserver,
     ObserverOrder,
 )
+from rsltrace.simulation.middleware.links import Network, fast_send
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher, Transport
 from rsltrace.simulation.middleware.qos.policies import DEFAULT_QOS, History
@@ -220,6 +232,199 @@ def test_what_is_no_part_of_a_run_is_refused() -> None:
     run.dispatcher.loop = None  # type: ignore[assignment]
     with pytest.raises(TypeError, match="a part of the run"):
         run.dispatcher.end_event()
+
+
+class PythonLoop(EventLoop):
+    next_arrival = EventLoop.python_next_arrival
+
+
+class DelayedRun:
+    """Two topics with delays; each message is answered by messages of both."""
+
+    def __init__(self, seed: int, *, compiled: bool) -> None:
+        self.rng = rng = random.Random(seed)
+        start_ns = rng.choice([5, 2**63 - 500])
+        self.loop = (EventLoop if compiled else PythonLoop)(
+            start_ns=start_ns,
+            timers=timer_queue(rng.choice(["creation", "heap"])),
+            stop_conditions=(
+                stop_at(start_ns + rng.randrange(3000), "the end"),
+                stop_after_events(300),
+            )[: rng.randrange(3)],
+        )
+        self.loop.min_step_ns = rng.choice([0, 0, 0, 7])
+        self.dispatcher = Dispatcher(self.loop)
+        handler: Any = None
+        self.node = Participant(self.dispatcher, "node", "/", handler)
+        if rng.random() < 0.7:
+            self.dispatcher.record(
+                Recorder(TraceWriter(None, force=False), keep_payload=lambda topic: True)
+            )
+        type_: Any = SimpleNamespace(
+            name="std_msgs/msg/String", describe=lambda: ("string data", "")
+        )
+        transport = Transport(self.dispatcher)
+        delays = Uniform(0, rng.choice([1, 30])), Constant(0), Constant(10), None
+        models = [
+            LinkModel(
+                rng.choice(delays),
+                drop=rng.choice([0.0, 0.0, 0.2]),
+                duplicate=rng.choice([0.0, 0.0, 0.2]),
+                keep_order=rng.random() < 0.8,
+            )
+            for _ in range(2)
+        ]
+        outage = LinkOutage(start_ns + 100, start_ns + 160)
+        plan = NetworkPlan(
+            topics=tuple(NameRule(f"/{i}", model) for i, model in enumerate(models)),
+            outages=(OutageRule("topic", "/0", outage),) if rng.random() < 0.2 else (),
+            seed=seed,
+            start_ns=start_ns,
+        )
+        transport.network = Network(self.dispatcher, plan)
+        self.publishers = [
+            Publisher(transport, self.node, f"/{i}", type_, DEFAULT_QOS) for i in range(2)
+        ]
+        self.log: list[Any] = []
+        self.subscriptions = []
+        for topic, publisher in enumerate(self.publishers):
+            for number in range(2):
+                depth = rng.choice([1, 2, 10])
+                subscription = Subscription(
+                    self.dispatcher,
+                    self.node,
+                    f"/{topic}",
+                    type_,
+                    replace(DEFAULT_QOS, depth=depth),
+                    partial(self.got, 2 * topic + number),
+                )
+                publisher.connect(subscription)
+                self.subscriptions.append(subscription)
+            for link in publisher.links or ():
+                is_compiled = getattr(link.send, "__name__", "") == "send_delayed"
+                if is_compiled and not compiled:
+                    link.send = fast_send(self.dispatcher, link, link._delay)
+        self.send = [one.send if compiled else one.send_any for one in self.publishers]
+        self.loop.ready.append(Acting(self))
+
+    def got(self, number: int, data: bytes) -> None:
+        self.log.append((self.loop.now_ns, self.loop.events, number, data))
+        self.act(len(data))
+
+    def act(self, size: int) -> None:
+        """Do some of what a callback may do."""
+        rng, loop = self.rng, self.loop
+        if loop.events < 300:
+            for _ in range(rng.choice([0, 1, 1, 2])):
+                self.send[rng.randrange(2)](rng.randbytes(size % 50 + 1))
+        what = rng.random()
+        if what < 0.02:
+            loop.schedule(loop.now_ns + rng.randrange(20), lambda: self.log.append("action"))
+        elif what < 0.04:
+            loop.schedule(loop.now_ns + 3, lambda: loop.ready.append(Acting(self)))
+        elif what < 0.06:
+            loop.tasks.append(Acting(self))
+        elif what < 0.08:
+            timer = TimerState(rng.choice([0, 9]), loop.now_ns, order=loop.events, owner=None)
+            timer.owner = Once(self, timer)
+            loop.timers.add(timer)
+        elif what < 0.1:
+            self.dispatcher.event.busy_ns = rng.choice([0, 8])
+        elif what < 0.11:
+            rng.choice(self.subscriptions).destroy()
+        elif what < 0.14:
+            one = rng.choice(self.subscriptions)
+            one.active = not one.active
+        elif what < 0.143:
+            loop.stop(Stop("stopped"))
+        elif what < 0.146:
+            loop.now_ns += 15  # as if it had waited
+
+    def outcome(self) -> Any:
+        try:
+            stop: Any = self.loop.run()
+        except OverflowError as error:  # numbers have 64 bits
+            stop = str(error)
+        recorder = self.dispatcher.recorder
+        return (
+            stop,
+            self.log,
+            (self.loop.now_ns, self.loop.events, self.loop.activity_ns, self.loop.looks_at),
+            sorted(self.dispatcher.outcome.drops.values()),
+            [release[:3] for release in sorted(self.loop.scheduled)],
+            [link.last_ns for one in self.publishers for link in one.links or ()],
+            None if recorder is None else recorder.writer._buffer.rows(),
+        )
+
+
+class Acting:
+    """Something ready that is no message."""
+
+    def __init__(self, run: DelayedRun) -> None:
+        self.run = run
+
+    def dispatch(self) -> None:
+        self.run.dispatcher.execute(self, 0, None, 0, self.run.act, (3,), 0, 0, 0)
+
+    def describe(self) -> str:
+        return "acting"
+
+
+class Once(Acting):
+    def __init__(self, run: DelayedRun, timer: TimerState) -> None:
+        self.run, self.timer = run, timer
+
+    def dispatch(self) -> None:
+        self.run.loop.timers.remove(self.timer)
+        super().dispatch()
+
+
+@needs_core
+def test_delays_do_the_same_compiled() -> None:
+    messages = 0
+    for seed in range(150):
+        ours, python = (DelayedRun(seed, compiled=it).outcome() for it in (True, False))
+        assert ours == python, seed
+        messages += len(ours[1])
+    assert messages > 3000
+
+
+@needs_core
+def test_a_broken_link_or_loop_is_refused() -> None:
+    """Whatever is missing, or replaced while it is used, there is an error and no crash."""
+    names = (
+        *("subscription", "_loop", "_dispatcher", "last_ns", "send", "_delay", "_arrives"),
+        *("tasks", "idle", "scheduled", "timers", "next_place", "gate", "min_step_ns", "looks_at"),
+        *("_until_events", "_quiet_ns", "ready", "now_ns"),
+    )
+    for name in names:
+        for broken in (None, object(), 3, [1], [()], [(1, 2)], "x"):
+            for late in (False, True):
+                run = DelayedRun(4, compiled=True)  # all its links only delay
+                link: Any = (run.publishers[0].links or [])[0]
+                assert link.send.__name__ == "send_delayed"
+                owner = link if hasattr(link, name) else run.loop
+
+                def break_it(owner: Any = owner, name: str = name, to: Any = broken) -> int:
+                    setattr(owner, name, to) if to is not None else delattr(owner, name)
+                    return 0
+
+                if late:
+                    link._delay = lambda leaves_ns, do=break_it: do()
+                else:
+                    break_it()
+                for publisher in run.publishers:
+                    with suppress(Exception):
+                        publisher.send(b"1")
+                        publisher.send(b"2")
+                with suppress(Exception):
+                    run.loop._until_events, run.loop._quiet_ns = 1000, 2**63
+                for _ in range(5):
+                    with suppress(Exception):
+                        run.loop.next_arrival()
+    del run.loop._quiet_ns
+    with pytest.raises(AttributeError, match="_quiet_ns"):
+        run.loop.next_arrival()
 
 
 @needs_core

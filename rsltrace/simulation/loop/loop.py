@@ -18,9 +18,9 @@ import itertools
 from collections import deque
 from collections.abc import Callable
 from heapq import heappop, heappush
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from rsltrace.compiled import LoopFields
+from rsltrace.compiled import LoopFields, core
 from rsltrace.errors import LivelockError
 from rsltrace.simulation.loop.stop import Progress, Stop, StopCondition, quiet_until_ns
 from rsltrace.simulation.loop.timer_queue import NEVER_NS, TimerQueue, TimerState
@@ -59,7 +59,8 @@ class EventLoop(LoopFields):
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
     (how many have run), ``activity_ns``. ``scheduled`` is a heap of releases. As long as there are
     fewer events than ``looks_at``, the loop would do nothing now but dispatch the next task or the
-    first of ``ready``: the code that now has the stack may do so instead.
+    first of ``ready``: the code that now has the stack may do so instead. While it is -1, the loop
+    would go on with ``next_arrival``; who does so instead sets ``stepped_ns`` to the time then.
 
     ``between_steps`` is called between time steps and returns how many events there must have been
     before it is called again. ``gate``, if set, is called between time steps with the time of the
@@ -96,6 +97,7 @@ class EventLoop(LoopFields):
         self.gate: Callable[[int | None], bool] | None = None
         self.stopped: Stop | None = None
         self.looks_at = -1
+        self.stepped_ns = -1
         self._interrupt = False
         self._livelock_limit = livelock_limit
         self._between_steps = between_steps
@@ -216,30 +218,15 @@ class EventLoop(LoopFields):
         timers = self.timers
         idle = self.idle
         quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
-        timer_ns = horizon_ns = self.looks_at = -1
+        self.looks_at = -1
         while True:
-            # Time steps with one arrival and nothing else due. To compare two times
-            # takes Python longer than to see that they are the same object, and here it shows.
-            while scheduled and not (ready or tasks or idle):
-                next_ns = scheduled[0][0]
-                if timers.next_ns is not timer_ns:
-                    timer_ns = timers.next_ns
-                    horizon_ns = min(timer_ns, quiet_ns)
-                if next_ns <= now_ns or next_ns >= horizon_ns:
-                    break
-                self.now_ns = now_ns = next_ns
-                release = heappop(scheduled)
-                receiver = release[3](release)
-                if scheduled and scheduled[0][0] <= now_ns:
-                    if receiver is not None:
-                        ready.append(receiver)
-                    break
-                if receiver is not None:
-                    receiver.dispatch()
-                elif ready:
-                    ready.popleft().dispatch()
-                if self.now_ns is not now_ns or self.events >= self._until_events:
-                    break
+            # Time steps with one arrival and nothing else due.
+            while (next_one := self.next_arrival()) is not False:
+                now_ns = self.now_ns
+                if next_one is not None:
+                    next_one.dispatch()
+            if self.stepped_ns == self.now_ns:
+                now_ns, self.stepped_ns = self.stepped_ns, -1
             while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
                 release = heappop(scheduled)
                 receiver = release[3](release)
@@ -279,6 +266,34 @@ class EventLoop(LoopFields):
             if next_ns >= quiet_ns or next_ns <= now_ns or next_ns == NEVER_NS:
                 return
             self.now_ns = now_ns = next_ns
+
+    def python_next_arrival(self) -> Dispatchable | Literal[False] | None:
+        """Move on to the next time step, if it has one arrival and nothing else has to be done or
+        checked before; else return False. Return what is to be dispatched now, None for nothing.
+        """
+        scheduled, ready = self.scheduled, self.ready
+        if not scheduled or ready or self.tasks or self.idle or self.gate is not None:
+            return False
+        next_ns = scheduled[0][0]
+        if (
+            not self.now_ns < next_ns < self._quiet_ns
+            or self.events >= self._until_events
+            or self.min_step_ns
+            or next_ns >= self.timers.next_ns
+        ):
+            return False
+        release = heappop(scheduled)
+        self.now_ns = next_ns
+        self.looks_at = -1
+        receiver: Dispatchable | None = release[3](release)
+        if scheduled and scheduled[0][0] <= self.now_ns:
+            if receiver is not None:
+                ready.append(receiver)
+            return None
+        return ready.popleft() if receiver is None and ready else receiver
+
+    if core is None or TYPE_CHECKING:
+        next_arrival = python_next_arrival
 
     def _run_idle(self) -> bool:
         """Let those poll who wait for idle time; return whether one has work now."""

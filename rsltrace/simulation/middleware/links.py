@@ -10,6 +10,7 @@ from collections.abc import Callable
 from heapq import heappush
 from typing import Any, Protocol
 
+from rsltrace.compiled import LinkFields, core
 from rsltrace.simulation.chance.channel import (
     LOST_BURST,
     LOST_DROP,
@@ -188,7 +189,7 @@ class ServiceLink:
             self._receiver.deliver(exchange)
 
 
-class PublisherLink:
+class PublisherLink(LinkFields):
     """The link from a publisher to a subscription; ``channel`` is None if messages arrive at once.
 
     What a reliable publisher cannot send during an outage waits in ``_held``, as many messages as
@@ -233,7 +234,12 @@ class PublisherLink:
         if channel is None:
             self.send = direct_send(dispatcher, self)
         elif channel.plain and channel.keep_order:
-            self.send = fast_send(dispatcher, self, channel.plain)
+            if core is None:
+                self.send = fast_send(dispatcher, self, channel.plain)
+            else:  # the same, compiled
+                link: Any = self
+                self._delay, self._arrives = channel.plain, link.arrive_delayed
+                self.send = link.send_delayed
 
     def _send(
         self, data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from asyncio import _get_running_loop
+from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
 from types import CodeType, FrameType
@@ -25,6 +26,7 @@ from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
 from rsltrace.simulation.middleware.events.event import OutsideEvent
+from rsltrace.simulation.middleware.subscription import NUMBER
 
 
 class StandbyOwner(Protocol):
@@ -148,19 +150,33 @@ class Standby:
     def _following(self) -> tuple[greenlet, Mailbox, Dispatchable] | None:
         """Take the loop's next item if a standby stack would run it, to switch there directly."""
         loop = self._loop
-        if loop.tasks or not loop.ready or loop.events >= loop.looks_at:
+        queue: deque[Any] = loop.ready
+        if loop.looks_at < 0:
+            if not loop.scheduled or len(loop.scheduled[0]) <= NUMBER:
+                return None  # no message: actions have to be called on the other stack
+            item = loop.next_arrival()
+            if item is False:
+                return None
+            loop.stepped_ns = loop.now_ns
+            if item is None:
+                return None
+            queue = loop.tasks  # it has been the turn of this one
+            if queue or self._dispatcher.has_outputs():
+                queue.appendleft(item)
+                return None
+        elif loop.tasks or not loop.ready or loop.events >= loop.looks_at:
             return None
-        item = loop.ready[0]
-        if not isinstance(item, ReceiverHandle) or item.node is None:
-            return None
-        mailbox: Mailbox | None = item.node.mailbox
-        if mailbox is None or mailbox.driver is None:
-            return None
-        standby: Any = mailbox.driver.standby
-        if standby is None or not standby._takes(item):
-            return None
-        loop.ready.popleft()
-        return standby.blocked.stack, mailbox, item
+        else:
+            item = queue.popleft()
+        mailbox: Mailbox | None = None
+        if isinstance(item, ReceiverHandle) and item.node is not None:
+            mailbox = item.node.mailbox
+        if mailbox is not None and mailbox.driver is not None:
+            standby: Any = mailbox.driver.standby
+            if standby is not None and standby._takes(item):
+                return standby.blocked.stack, mailbox, item
+        queue.appendleft(item)
+        return None
 
 
 def _is_free(item: Any) -> bool:

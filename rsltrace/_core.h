@@ -1,0 +1,142 @@
+/* What _core.c and _loop.c share. */
+
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030A0000
+#include <Python.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+#include <structmember.h>
+
+/* Headers from 3.12 on do not count this reference: it would be lost in older versions, for which the
+   module is built, too. */
+#undef Py_RETURN_NONE
+#define Py_RETURN_NONE return Py_NewRef(Py_None)
+
+/* Base classes of Python's: what is read here lies in a struct, where Python reads and writes it
+   like a slot. A field is NULL until it is set. They have object's __new__, the only one that lets
+   Python 3.11 keep the other attributes without a dict. */
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *now_ns, *events, *activity_ns, *ready;
+} Loop; /* what each event needs of it */
+
+typedef struct {
+  Loop of_events;
+  PyObject *tasks, *idle, *scheduled, *timers, *next_place, *gate, *min_step_ns;
+  PyObject *looks_at, *until_events, *quiet_ns;
+} WholeLoop;
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *handle, *entity, *node, *kind, *cause_event, *cause_output, *input_hash;
+  PyObject *flags, *quiet, *busy_ns, *on_end;
+} Event;
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *loop, *event, *entities, *recorder, *unrecorded, *pending, *before, *after;
+} Dispatcher;
+
+typedef struct {
+  PyObject_HEAD
+  /* Not every entity has all of these. */
+  PyObject *active, *state, *queue, *keep;
+  PyObject *node, *destroyed, *wrapper, *own_group, *mailbox;
+  PyObject *callback, *coroutine, *with_info, *deserialize, *serialize, *sites;
+  PyObject *dispatcher, *entity_id; /* from here on what a publisher has */
+  PyObject *subscriptions, *links, *observers, *count, *channel, *history, *offers, *faults;
+} Entity;
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *due, *running;
+} Sites;
+
+extern PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type;
+extern PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen;
+extern PyMemberDef loop_fields[], event_fields[], dispatcher_fields[], entity_fields[];
+
+#define FIELD_COUNT(Struct) ((sizeof(Struct) - sizeof(PyObject)) / sizeof(PyObject *))
+
+#define FIELDS(Struct, prefix)                                                       \
+  static int prefix##_traverse(PyObject *self, visitproc visit, void *arg) {         \
+    Py_VISIT(Py_TYPE(self));                                                         \
+    for (size_t i = 0; i < FIELD_COUNT(Struct); ++i)                                 \
+      Py_VISIT(((PyObject **)(self + 1))[i]);                                        \
+    return 0;                                                                        \
+  }                                                                                  \
+  static int prefix##_clear(PyObject *self) {                                        \
+    for (size_t i = 0; i < FIELD_COUNT(Struct); ++i)                                 \
+      Py_CLEAR(((PyObject **)(self + 1))[i]);                                        \
+    return 0;                                                                        \
+  }                                                                                  \
+  static void prefix##_dealloc(PyObject *self) {                                     \
+    PyTypeObject *type = Py_TYPE(self);                                              \
+    PyObject_GC_UnTrack(self);                                                       \
+    prefix##_clear(self);                                                            \
+    PyObject_GC_Del(self);                                                           \
+    Py_DECREF(type);                                                                 \
+  }                                                                                  \
+  static PyTypeObject *prefix##_made(PyMemberDef *fields,  PyMethodDef *methods) {   \
+    PyType_Slot slots[] = {                                                          \
+        {Py_tp_dealloc, prefix##_dealloc}, {Py_tp_traverse, prefix##_traverse},      \
+        {Py_tp_clear, prefix##_clear},     {Py_tp_members, fields},                  \
+        {Py_tp_methods, methods},          {0, NULL},                                \
+    };                                                                               \
+    PyType_Spec spec = {                                                             \
+        "rsltrace._core." #Struct "Fields", sizeof(Struct), 0,                       \
+        Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, slots,        \
+    };                                                                               \
+    return (PyTypeObject *)PyType_FromSpec(&spec);                                   \
+  }
+
+#define FIELD(Struct, field, name) {name, T_OBJECT_EX, offsetof(Struct, field), 0, NULL}
+#define NO_FIELD {NULL, 0, 0, 0, NULL}
+
+/* Whether an object is of a class of ours. ``seen`` is the last of its subclasses that was found to
+   be one: to look for a base class takes long. */
+static inline int is_a(PyObject *object, PyTypeObject *type, PyObject **seen) {
+  PyObject *own = (PyObject *)Py_TYPE(object), *old = *seen;
+  if (own == old) return 1;
+  if (!PyType_IsSubtype((PyTypeObject *)own, type)) return 0;
+  *seen = Py_NewRef(own);
+  Py_XDECREF(old);
+  return 1;
+}
+
+/* Sets the error for an object without the fields of a struct. */
+void refuse(PyObject *object, PyTypeObject *type, const PyMemberDef *fields, size_t first);
+
+/* Whether an object has the fields of a struct, all set from ``first`` on; else sets an error. It is
+   asked more often than anything else: let the compiler write it out. */
+static inline __attribute__((always_inline)) int has_fields(
+    PyObject *object, PyTypeObject *type, PyObject **seen, const PyMemberDef *fields,
+    size_t first, size_t count) {
+  int has = object != NULL && is_a(object, type, seen);
+#pragma GCC unroll 16
+  for (size_t i = first; i < count; ++i) has = has && ((PyObject **)(object + 1))[i] != NULL;
+  if (!has) refuse(object, type, fields, first);
+  return has;
+}
+
+#define HAS_FIELDS(object, Struct, prefix) \
+  has_fields((PyObject *)(object), prefix##_type, &prefix##_seen, prefix##_fields, 0, \
+             FIELD_COUNT(Struct))
+
+/* Replaces a field by a new object, or fails if there is none. */
+int set(PyObject **field, PyObject *value);
+
+int done(PyObject *result);
+int append_to(PyObject *queue, PyObject *item);
+int record_draw(PyObject *recorder, PyObject *entity, PyObject *draw);
+
+/* Puts an arrival into the queue of its receiver; returns whether that is ready for it now. */
+int queue_arrival(PyObject *receiver, PyObject *arrival);
+
+/* Sends a delivery over a link. */
+int send_over(PyObject *link, PyObject *delivery);
+
+int add_loop_types(PyObject *module);
+int add_message_plan(PyObject *module); /* of _cdr.c */
