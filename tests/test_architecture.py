@@ -284,6 +284,7 @@ RUNS_CODE = {
     "rsltrace/cli/main.py": "import_module",  # the module of a command
     "rsltrace/compiled.py": "import_module",  # our own in C
     "rsltrace/job/__init__.py": "import_module",  # public names of jobs
+    "rsltrace/job/parts/keys.py": "import_module",  # parts of jobs, when a job has them
     "rsltrace/debug/simulation.py": "import_module",  # rclpy, before the first run
     "rsltrace/adapters/rclpy/boundary/installation.py": "exec_module import_module",  # of rosidl
     "rsltrace/adapters/rclpy/executors/user_executors.py": "import_module",  # functions of rclpy

@@ -9,27 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
-from rsltrace.job.parts.bag import BagSpec
-from rsltrace.job.parts.check import CheckSpec, MetricSpec, check_metric_name
-from rsltrace.job.parts.clocks import ClockSpec, clocks_part
-from rsltrace.job.parts.delay import DelaysSpec
-from rsltrace.job.parts.distribution import files_of
-from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.job.parts.guard import GuardSpec, guard_part
-from rsltrace.job.parts.launch import LaunchSpec
+from rsltrace.job.parts.keys import later
 from rsltrace.job.parts.node import NodeSpec
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.parts.record import HooksSpec, RecordSpec
-from rsltrace.job.parts.scheduling import (
-    ExecutionSpec,
-    ExecutorSpec,
-    PolicySpec,
-    ThreadsSpec,
-    executors_part,
-    policy_part,
-)
 from rsltrace.job.parts.stop import StopSpec
-from rsltrace.job.parts.vary import VarySpec
 from rsltrace.job.values.checks import (
     attach,
     check,
@@ -48,6 +33,29 @@ from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.problem import JobProblem, Loc, describe
 from rsltrace.job.values.times import TimeLike, parse_time
 
+if TYPE_CHECKING:
+    from rsltrace.job.parts.bag import BagSpec
+    from rsltrace.job.parts.check import CheckSpec, MetricSpec
+    from rsltrace.job.parts.clocks import ClockSpec
+    from rsltrace.job.parts.delay import DelaysSpec
+    from rsltrace.job.parts.fault import FaultSpec
+    from rsltrace.job.parts.launch import LaunchSpec
+    from rsltrace.job.parts.scheduling import ExecutionSpec, ExecutorSpec, PolicySpec, ThreadsSpec
+    from rsltrace.job.parts.vary import VarySpec
+else:
+    # What most jobs do without: importing all parts takes as long as importing pydantic.
+    _PARTS = "rsltrace.job.parts."
+    globals().update(
+        later(f"{_PARTS}bag", "BagSpec")
+        | later(f"{_PARTS}check", "CheckSpec", "MetricSpec")
+        | later(f"{_PARTS}clocks", "ClockSpec")
+        | later(f"{_PARTS}delay", "DelaysSpec")
+        | later(f"{_PARTS}fault", "FaultSpec")
+        | later(f"{_PARTS}launch", "LaunchSpec")
+        | later(f"{_PARTS}scheduling", "ExecutionSpec", "ExecutorSpec", "PolicySpec", "ThreadsSpec")
+        | later(f"{_PARTS}vary", "VarySpec")
+    )
+
 SEED_MAX = 2**64 - 1
 LIVELOCK_LIMIT = 100_000
 
@@ -63,6 +71,74 @@ def _word(value: object) -> str:
 
 
 attach(_word, schema={"type": ["string", "number"]})
+
+
+def _metric_name(name: str) -> None:
+    if not name.strip() or not name.isprintable():
+        raise ValueError(f"{describe(name)} is no name: use a word, as in distance")
+
+
+attach(_metric_name, pattern=r"\S")
+
+
+def _clocks(value: object) -> object:
+    """Let one mapping stand for a list with it."""
+    if isinstance(value, dict):
+        return (value,)
+    if not isinstance(value, (list, tuple)):
+        raise JobProblem(
+            "expected a list of clocks, or what is different about all of them "
+            f"(advances: true), got {describe(value)}"
+        )
+    return tuple(value)
+
+
+def _policy(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    from rsltrace.job.parts.scheduling import policy_named
+
+    return policy_named(value)
+
+
+_EXECUTORS: dict[str, list[dict[str, Any]]] = {
+    "single_threaded": [{"nodes": ["*"], "workers": 1}],
+    "per_node": [],
+}
+
+
+def _executors(value: object) -> object:
+    """Let ``single_threaded`` and ``per_node`` stand for the lists they mean."""
+    if isinstance(value, str) and value in _EXECUTORS:
+        value = _EXECUTORS[value]
+    if not isinstance(value, (list, tuple)):
+        hint = ""
+        if isinstance(value, str) and value.startswith("multi"):
+            hint = "; write [{workers: 4}]"
+        raise JobProblem(
+            f"expected {' or '.join(_EXECUTORS)} or a list of executors, got "
+            f"{describe(value)}{hint}"
+        )
+    return tuple(value)
+
+
+def _files_of(value: object, loc: Loc = ()) -> Iterator[tuple[Loc, str]]:
+    """Yield (place, path) of every ``file`` in a part, however deep."""
+    if isinstance(value, JobPart):
+        for name, field in type(value).model_fields.items():
+            inner = getattr(value, name)
+            place = (*loc, field.alias or name)
+            if name == "file" and inner is not None:
+                yield place, inner
+            else:
+                yield from _files_of(inner, place)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _files_of(inner, (*loc, key))
+    elif isinstance(value, tuple):
+        for index, inner in enumerate(value):
+            yield from _files_of(inner, (*loc, index))
+
 
 COMMAND_LINE = "<command line>"
 """The ``source_name`` of a job of programs on a command line."""
@@ -156,7 +232,7 @@ class JobFields(JobPart):
         examples=[{"default": "1ms", "topics": {"/scan": {"uniform": {"min": 0, "max": "5ms"}}}}],
     )
 
-    policy: Annotated[PolicySpec | None, policy_part] = Field(
+    policy: Annotated[PolicySpec | None, check(_policy, optional=True, shorthand="order")] = Field(
         default=None,
         description="Which ready callback runs next. Default: `fifo`.",
         examples=["rate_monotonic", {"recorded": "run1.mcap"}],
@@ -178,7 +254,10 @@ class JobFields(JobPart):
         description="Smallest step of simulated time. Work due within a step runs late.",
         examples=["1ms"],
     )
-    executors: Annotated[tuple[ExecutorSpec, ...] | None, executors_part] = Field(
+    executors: Annotated[
+        tuple[ExecutorSpec, ...] | None,
+        check(_executors, optional=True, words=tuple(_EXECUTORS)),
+    ] = Field(
         default=None,
         description="Simulated executors: one for all nodes (`single_threaded`), one for "
         "each (`per_node`), or a list. Other nodes have one each.",
@@ -189,7 +268,7 @@ class JobFields(JobPart):
         description="Execution times of callbacks.",
         examples=[{"nodes": {"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}}],
     )
-    clocks: Annotated[tuple[ClockSpec, ...], clocks_part] = Field(
+    clocks: Annotated[tuple[ClockSpec, ...], check(_clocks, or_entry=True)] = Field(
         default=(),
         description="Clocks that differ from simulated time. A single mapping applies to all "
         "nodes.",
@@ -221,7 +300,7 @@ class JobFields(JobPart):
     )
 
     metrics: Annotated[
-        dict[str, MetricSpec], named_parts("expression", check_metric_name, what="metrics")
+        dict[str, MetricSpec], named_parts("expression", _metric_name, what="metrics")
     ] = Field(
         default_factory=dict,
         description="Numbers computed from the finished run, by name.",
@@ -290,7 +369,7 @@ class JobFields(JobPart):
 
     def model_files(self) -> Iterator[tuple[Loc, str]]:
         """Yield (place in the job, path) of the files that its delays come from."""
-        yield from files_of(self.delay, ("delay",))
-        yield from files_of(self.execution, ("execution",))
+        yield from _files_of(self.delay, ("delay",))
+        yield from _files_of(self.execution, ("execution",))
         if self.policy is not None and self.policy.recorded is not None:
             yield ("policy", "recorded"), self.policy.recorded

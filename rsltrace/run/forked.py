@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
 
 from greenlet import getcurrent
 
@@ -25,7 +25,7 @@ from rsltrace.forking import (
     own_children,
     why_not,
 )
-from rsltrace.job import FaultSpec, Job
+from rsltrace.job import Job
 from rsltrace.run.driver import next_step_ns
 from rsltrace.run.inputs import check_output
 from rsltrace.run.session import RunResult, RunSession
@@ -33,6 +33,9 @@ from rsltrace.run.stop_rules import given_rules
 from rsltrace.simulation.loop.policy import Departures
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.writer import TraceWriter
+
+if TYPE_CHECKING:
+    from rsltrace.job import FaultSpec
 
 # Stop in the middle of a run, from where runs of other jobs continue. Their jobs differ only in
 # what comes later (``RunSession.becomes``): each run is as if made from the beginning.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from rsltrace.adapters.launch.model import JobExpansion
+from rsltrace.adapters.launch import JobExpansion
 from rsltrace.errors import OutputError
 from rsltrace.job import Job
 from rsltrace.run.plans.executables import compiled_file, why_not_runnable

@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rsltrace.errors import DeadlockError, RunError, near_or_all
-from rsltrace.job import FaultSpec, Job, load_job
+from rsltrace.job import Job, load_job
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_time, parse_time_in_run
 from rsltrace.run.driver import Driver
@@ -19,6 +19,9 @@ from rsltrace.run.session import RunResult, RunSession
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.texts import format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.job import FaultSpec
 
 
 class TopicTap:

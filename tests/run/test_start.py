@@ -42,7 +42,21 @@ _NOT_NEEDED = (
         "rosbags",
         "rich",
         "rsltrace.adapters.launch.expand",
+        "rsltrace.adapters.launch.model",
         "rsltrace.adapters.workspace.interfaces",
+    ),
+    *(
+        f"rsltrace.job.parts.{part}"
+        for part in (
+            "bag",
+            "check",
+            "clocks",
+            "delay",
+            "distribution",
+            "fault",
+            "scheduling",
+            "vary",
+        )
     ),
 )
 
@@ -56,6 +70,30 @@ def test_a_small_run_loads_no_generators_no_plugins_and_no_metadata(tmp_path: Pa
     loaded = done.stdout.splitlines()[-1]
     assert '"rsltrace.run.session"' in loaded
     assert [name for name in _NOT_NEEDED if f'"{name}"' in loaded] == []
+
+
+_PARTS_AT_FIRST_USE = """
+import sys
+import rsltrace
+
+job = rsltrace.Job(nodes=[{"node": "n:N"}], stop={"duration": "1s"})
+built = lambda kind: kind.__pydantic_complete__
+from rsltrace.job import NodeSpec
+from rsltrace.job.parts.process import RespawnSpec
+assert built(NodeSpec) and not built(RespawnSpec)
+assert "rsltrace.job.parts.delay" not in sys.modules
+delayed = rsltrace.Job(nodes=[{"node": "n:N", "start_after": "1s"}], delay={"default": "1ms"})
+from rsltrace.job.parts.delay import DelaySpec, DelaysSpec
+assert type(delayed.delay) is DelaysSpec and type(delayed.delay.default) is DelaySpec
+assert delayed.replace(delay=delayed.delay) == delayed and built(DelaySpec)
+"""
+
+
+def test_parts_of_a_job_are_loaded_and_built_at_first_use() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _PARTS_AT_FIRST_USE], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
 
 
 @fast_dataclass.dataclass(frozen=True, slots=True)

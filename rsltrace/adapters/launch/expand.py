@@ -11,9 +11,8 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from rsltrace.adapters.launch import ros_launch
+from rsltrace.adapters.launch import JobExpansion, ros_launch
 from rsltrace.adapters.launch.model import (
-    JobExpansion,
     LaunchArgument,
     LaunchResult,
     argument_words,

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.constructor import SafeConstructor
@@ -14,7 +14,6 @@ from ruamel.yaml.error import YAMLError
 
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.job import Job
 from rsltrace.job.reading.yaml_source import SourcePlace
 from rsltrace.trace.model.operation import nested_too_deep
 from rsltrace.trace.model.texts import printable
@@ -173,16 +172,6 @@ def equal_texts(a: str, b: str) -> bool:
         return math.isclose(float(a), float(b))
     except ValueError:
         return a == b
-
-
-# What becomes of a job with launch files.
-
-
-class JobExpansion(NamedTuple):
-    """A job without launch files, and what of them it leaves out or has no use for."""
-
-    job: Job
-    notes: tuple[str, ...] = ()
 
 
 # The tree that XML and YAML launch files have in common, every part with its place.

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from rsltrace.job.job import Job
-from rsltrace.job.parts.keys import attached, file_fields
+from rsltrace.job.parts.keys import attached, file_fields, model_of
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.reading.compose import CompositionKeys
 from rsltrace.job.values.times import TIME_SCHEMA, format_time
@@ -193,18 +193,19 @@ class _Maker:
             value = self._short(arguments[1], facts.get("value_shorthand"))
             names = {"propertyNames": facts["names"]} if "names" in facts else {}
             return {"type": "object", **names, "additionalProperties": value}
-        if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
+        if model_of(annotation) is not None:
             return self._short(annotation, facts.get("shorthand"))
         return dict(_SCALARS.get(annotation, {}))
 
     def _short(self, annotation: Any, shorthand: str | None) -> Schema:
         """Return the schema of a part, or of the value of one key that may stand for it."""
-        if not (inspect.isclass(annotation) and issubclass(annotation, BaseModel)):
+        model = model_of(annotation)
+        if model is None:
             return self._of(annotation, [])
-        reference = self.reference(annotation)
+        reference = self.reference(model)
         if shorthand is None:
             return reference
-        field = next(field for key, field in file_fields(annotation) if key == shorthand)
+        field = next(field for key, field in file_fields(model) if key == shorthand)
         short = self._of(field.annotation, field.metadata)
         return {"anyOf": [reference, *_options(short)]}
 

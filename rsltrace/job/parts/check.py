@@ -92,15 +92,6 @@ class LatencySpec(JobPart):
 # ``metrics:`` of a job: numbers that say how a run went, found out from its trace.
 
 
-def check_metric_name(name: str) -> None:
-    """Raise ``ValueError`` unless ``name`` can be the name of a metric: one line of text."""
-    if not name.strip() or not name.isprintable():
-        raise ValueError(f"{describe(name)} is no name: use a word, as in distance")
-
-
-check_metric_name.pattern = r"\S"  # type: ignore[attr-defined]
-
-
 class MetricSpec(JobPart):
     """One number. Exactly one of ``expression`` and ``function``; a text alone is an
     ``expression``."""

@@ -147,18 +147,3 @@ class ClockSpec(JobPart):
     def drift(self) -> Fraction:
         """The drift as an exact fraction."""
         return Fraction(self.drift_ppm) / 1_000_000
-
-
-def _clocks(value: object) -> object:
-    """Let one mapping stand for a list with it."""
-    if isinstance(value, dict):
-        return (value,)
-    if not isinstance(value, (list, tuple)):
-        raise JobProblem(
-            "expected a list of clocks, or what is different about all of them "
-            f"(advances: true), got {describe(value)}"
-        )
-    return tuple(value)
-
-
-clocks_part = check(_clocks, or_entry=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
@@ -10,7 +9,7 @@ from pydantic import Field, model_validator
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, given, items, number, one_of, positive_time
 from rsltrace.job.values.mappings import check_path
-from rsltrace.job.values.problem import JobProblem, Loc
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.times import TIME_SCHEMA, UNITS_NS, parse_time
 from rsltrace.simulation.chance.distribution import LONGEST_NS
 
@@ -313,21 +312,3 @@ class DistributionSpec(JobPart):
         """Return which of ``KINDS`` are given."""
         values = {**vars(self), "constant": self.constant_ns}
         return [kind for kind in self.KINDS if values[kind] is not None]
-
-
-def files_of(value: object, loc: Loc = ()) -> Iterator[tuple[Loc, str]]:
-    """Yield (place, path) of every ``file`` in a part, however deep."""
-    if isinstance(value, JobPart):
-        for name, field in type(value).model_fields.items():
-            inner = getattr(value, name)
-            place = (*loc, field.alias or name)
-            if name == "file" and inner is not None:
-                yield place, inner
-            else:
-                yield from files_of(inner, place)
-    elif isinstance(value, dict):
-        for key, inner in value.items():
-            yield from files_of(inner, (*loc, key))
-    elif isinstance(value, tuple):
-        for index, inner in enumerate(value):
-            yield from files_of(inner, (*loc, index))

@@ -3,12 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any, get_args, get_origin
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, ClassVar, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
+from pydantic_core.core_schema import with_info_plain_validator_function
 
 from rsltrace.job.values.problem import Loc
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core import CoreSchema
+
+
+class LaterPart:
+    """Stands in annotations for a part whose module is imported for the jobs that have the part."""
+
+    HOME: ClassVar[str]
+
+    @classmethod
+    def model(cls) -> type[BaseModel]:
+        """Return the part."""
+        found: type[BaseModel] = getattr(import_module(cls.HOME), cls.__name__)
+        return found
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return with_info_plain_validator_function(
+            lambda value, info: cls.model().model_validate(value, context=info.context)
+        )
+
+
+def later(home: str, *names: str) -> dict[str, type[LaterPart]]:
+    """Return what stands for the parts of a module, by name."""
+    return {name: type(name, (LaterPart,), {"HOME": home}) for name in names}
+
+
+def model_of(annotation: Any) -> type[BaseModel] | None:
+    """Return the model that an annotation is, if it is one."""
+    if not isinstance(annotation, type) or get_args(annotation):
+        return None  # in Python 3.10 tuple[X, ...] calls itself a type
+    if issubclass(annotation, LaterPart):
+        return annotation.model()
+    return annotation if issubclass(annotation, BaseModel) else None
 
 
 def file_fields(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
@@ -20,12 +60,10 @@ def file_fields(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
 
 def models_in(annotation: Any) -> list[type[BaseModel]]:
     """Return the models that values of an annotation may be made of."""
-    # In Python 3.10 tuple[X, ...] calls itself a type, so what is inside comes first.
     if inner := get_args(annotation):
         return [found for argument in inner for found in models_in(argument)]
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return []
+    model = model_of(annotation)
+    return [] if model is None else [model]
 
 
 def keys_with(model: type[BaseModel], key: str) -> list[str]:

@@ -10,10 +10,12 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
+from contextvars import ContextVar
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, model_validator
+from pydantic_core.core_schema import with_info_plain_validator_function
 
 from rsltrace.errors import JobError, nearest
 from rsltrace.job.parts.keys import field_at, file_fields, models_in
@@ -31,6 +33,8 @@ from rsltrace.job.values.problem import (
 from rsltrace.job.values.times import Nanoseconds
 
 if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core import CoreSchema
     from typing_extensions import Self
 
 # What pydantic finds wrong with a job, in words for its author and with each mistake's place.
@@ -145,6 +149,8 @@ _PLUGINS = "pydantic.plugin._loader"
 """What pydantic asks for plugins when it builds a model: it reads the metadata of all packages that
 are installed, which takes longer than to read a job."""
 
+_being_built: ContextVar[type[BaseModel] | None] = ContextVar("_being_built", default=None)
+
 
 class JobPart(BaseModel):
     """Base of a job and its parts. Built wrongly, it raises ``JobError``, not pydantic's error."""
@@ -189,15 +195,28 @@ class JobPart(BaseModel):
     @classmethod
     def model_rebuild(cls, **options: Any) -> bool | None:
         """Build what checks a part, when it is first used; plugins have no say in it."""
-        if _PLUGINS in sys.modules:
-            return super().model_rebuild(**options)
         without: Any = ModuleType(_PLUGINS)
         without.get_plugins = tuple
-        sys.modules[_PLUGINS] = without
+        hidden = sys.modules.setdefault(_PLUGINS, without) is without
+        outer = _being_built.set(cls)
         try:
             return super().model_rebuild(**options)
         finally:
-            del sys.modules[_PLUGINS]
+            _being_built.reset(outer)
+            if hidden:
+                del sys.modules[_PLUGINS]
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: type[BaseModel], handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Let a part check the parts in it by what they have built themselves: most jobs have few
+        of the parts that there may be."""
+        if _being_built.get() is cls:
+            return handler(source)
+        return with_info_plain_validator_function(
+            lambda value, info: cls.model_validate(value, context=info.context)
+        )
 
     def replace(self, **changes: object) -> Self:
         """Return a copy with ``changes`` (keys as in the constructor), validated again."""

@@ -248,10 +248,8 @@ class ThreadsSpec(JobPart):
     )
 
 
-def _policy(value: object) -> object:
-    """Let a word stand for ``{order: word}``."""
-    if not isinstance(value, str):
-        return value
+def policy_named(value: str) -> dict[str, str]:
+    """Return what a word stands for: ``{order: word}``."""
     if value in PolicySpec.ONE_OF:
         example = PolicySpec.model_fields[value].examples or [None]
         shown = json.dumps({value: example[0]}).replace('"', "")
@@ -265,29 +263,3 @@ def _policy(value: object) -> object:
             f"{' or '.join(PolicySpec.ONE_OF[1:])}, got {describe(value)}{hint}"
         )
     return {"order": value}
-
-
-policy_part = check(_policy, optional=True, shorthand="order")
-
-_EXECUTORS: dict[str, list[dict[str, Any]]] = {
-    "single_threaded": [{"nodes": ["*"], "workers": 1}],
-    "per_node": [],
-}
-
-
-def _executors(value: object) -> object:
-    """Let ``single_threaded`` and ``per_node`` stand for the lists they mean."""
-    if isinstance(value, str) and value in _EXECUTORS:
-        value = _EXECUTORS[value]
-    if not isinstance(value, (list, tuple)):
-        hint = ""
-        if isinstance(value, str) and value.startswith("multi"):
-            hint = "; write [{workers: 4}]"
-        raise JobProblem(
-            f"expected {' or '.join(_EXECUTORS)} or a list of executors, got "
-            f"{describe(value)}{hint}"
-        )
-    return tuple(value)
-
-
-executors_part = check(_executors, optional=True, words=tuple(_EXECUTORS))

@@ -12,7 +12,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import BagError, SetupError
-from rsltrace.job import BagSpec, Job, locate
+from rsltrace.job import Job, locate
 from rsltrace.job.values.names import check_topic
 from rsltrace.run.plans.faults import BagFaults, check_changes
 from rsltrace.run.stop_rules import end_ns_of, has_stop
@@ -24,6 +24,7 @@ from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.handles.node import NodeHandle
     from rsltrace.adapters.rclpy.world import World
+    from rsltrace.job import BagSpec
     from rsltrace.trace.recordings import Bag
     from rsltrace.trace.recordings.playback import Playback
     from rsltrace.trace.recordings.topic import BagTopic, StoredTopic

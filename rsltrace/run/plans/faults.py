@@ -24,7 +24,6 @@ from rsltrace.adapters.rclpy.messages.message_spec import (
 )
 from rsltrace.errors import BagError, did_you_mean
 from rsltrace.job import Job, locate
-from rsltrace.job.parts.fault import FaultSpec, Step, field_steps, number_of
 from rsltrace.simulation.middleware.interface import MessageFault, TopicFaults
 
 if TYPE_CHECKING:
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from rsltrace.adapters.player import Message as BagMessage
     from rsltrace.adapters.rclpy.faults import NodeFaults
     from rsltrace.adapters.rclpy.world import World
+    from rsltrace.job.parts.fault import FaultSpec, Step
 
 
 _FLOAT_MAX = {"f": 3.4028234663852886e38, "d": 1.7976931348623157e308}
@@ -47,6 +47,8 @@ def field_changer(message_class: type, spec: FaultSpec) -> Callable[[bytes], byt
 
     :raises UnfitError: the class has no such field, or the value does not fit.
     """
+    from rsltrace.job.parts.fault import field_steps
+
     assert spec.field is not None
     steps = field_steps(spec.field)
     new = _change_of(spec, _type_at(message_spec(message_class), steps))
@@ -161,6 +163,8 @@ def _fitting(item: PrimitiveType | StringType, value: Any, name: str) -> Any:
         if not isinstance(value, bool):
             raise FieldChangeError(f"{name} is true or false, not {value!r}")
         return value
+    from rsltrace.job.parts.fault import number_of
+
     number = number_of(value)
     if number is None:
         raise FieldChangeError(f"{name} is a number, not {value!r}")

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from rsltrace.adapters.rclpy.node_clocks import ClockRule
 from rsltrace.job import Job, locate
-from rsltrace.job.parts.delay import DelaySpec
-from rsltrace.job.parts.distribution import DistributionSpec
-from rsltrace.job.reading.delay_files import read_rslcpp, read_samples, read_series
 from rsltrace.job.values.problem import Loc
 from rsltrace.simulation.chance.channel import (
     BurstLoss,
@@ -32,6 +30,10 @@ from rsltrace.simulation.chance.distribution import (
 )
 from rsltrace.simulation.chance.stream import ClockModel
 from rsltrace.trace.model.texts import format_duration
+
+if TYPE_CHECKING:
+    from rsltrace.job.parts.delay import DelaySpec
+    from rsltrace.job.parts.distribution import DistributionSpec
 
 
 def clock_rules(job: Job) -> tuple[ClockRule, ...]:
@@ -98,6 +100,8 @@ def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:
 def _table(job: Job, file: str | None) -> tuple[NameRule, ...]:
     if file is None:
         return ()
+    from rsltrace.job.reading.delay_files import read_rslcpp
+
     name = job.shown(file)
     rows = read_rslcpp(job.resolve(file), name)
     return tuple(
@@ -122,6 +126,8 @@ def link_model(job: Job, spec: DelaySpec) -> LinkModel:
 
 def make_distribution(job: Job, spec: DistributionSpec) -> Distribution:
     """Return the distribution of a job's spec; reads files."""
+    from rsltrace.job.reading.delay_files import read_samples, read_series
+
     if spec.constant_ns is not None:
         return Constant(spec.constant_ns)
     if spec.uniform is not None:

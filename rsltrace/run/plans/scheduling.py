@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.adapters.rclpy.hints import cannot_import, import_raised
 from rsltrace.errors import JobError, RsltraceError, did_you_mean
 from rsltrace.job import Job, locate
-from rsltrace.job.parts.scheduling import EVERY_LINE, PolicySpec
 from rsltrace.run.plans.network import make_distribution
 from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.policy import (
@@ -31,6 +30,7 @@ from rsltrace.simulation.middleware.events.failure import exception_text
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.entry import JobEntry
     from rsltrace.adapters.rclpy.world import World
+    from rsltrace.job.parts.scheduling import PolicySpec
     from rsltrace.simulation.middleware.scheduling import SchedulingPlan
 
 # What a job names as ``module:attribute``.
@@ -81,7 +81,11 @@ def is_ordered(job: Job) -> bool:
 
 def switches_at_lines(job: Job) -> bool:
     """Whether a thread may go on in the middle of another's callback."""
-    return job.threads is not None and job.threads.switch == EVERY_LINE
+    if job.threads is None:
+        return False
+    from rsltrace.job.parts.scheduling import EVERY_LINE
+
+    return job.threads.switch == EVERY_LINE
 
 
 def scheduling_plan(job: Job, start_ns: int, policy: ExecutionPolicy | None) -> SchedulingPlan:
