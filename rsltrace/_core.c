@@ -1202,7 +1202,8 @@ static struct PyModuleDef definition = {
 
 PyMODINIT_FUNC PyInit__core(void) {
   PyObject *module = PyModule_Create(&definition);
-  if (module != NULL && (add_types(module) < 0 || add_loop_types(module) < 0 || add_message_plan(module) < 0))
+  if (module != NULL && (add_types(module) < 0 || add_loop_types(module) < 0 ||
+                         add_message_plan(module) < 0 || add_turns(module) < 0))
     Py_CLEAR(module);
   return module;
 }

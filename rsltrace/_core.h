@@ -140,3 +140,4 @@ int send_over(PyObject *link, PyObject *delivery);
 
 int add_loop_types(PyObject *module);
 int add_message_plan(PyObject *module); /* of _cdr.c */
+int add_turns(PyObject *module);

@@ -8,14 +8,16 @@ import os
 import select
 import struct
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.processes.wire import RECORD, CommandKind, WireError
 from rsltrace.child_processes import how_ended, kill_group
+from rsltrace.compiled import core
 from rsltrace.errors import JobError
 from rsltrace.guard.pin import fix_addresses
 from rsltrace.guard.redirect import copy_of
@@ -24,6 +26,8 @@ from rsltrace.guard.redirect import copy_of
 
 _LENGTH = struct.Struct("<Q")
 _SIZE = 1 << 16
+_TURNS = 32
+"""Where what a process has said begins: behind the length, and whose turn it is (``turns.h``)."""
 
 
 class SharedMemory:
@@ -69,10 +73,10 @@ class ProcessMessages(SharedMemory):
 
         :raises WireError: if that is nothing that makes sense.
         """
-        end = _LENGTH.size + _LENGTH.unpack_from(self.data)[0]
+        end = _TURNS + _LENGTH.unpack_from(self.data)[0]
         if end > self.size and not self.has(end):
             raise WireError("a process has sent what is no batch")
-        return self.data, _LENGTH.size, end
+        return self.data, _TURNS, end
 
     def taken(self) -> None:
         """Make room for the next batch."""
@@ -187,6 +191,12 @@ class ProcessHandle:
         self._link.callback(os.close, bell)
         epoll.register(bell, select.EPOLLIN | select.EPOLLET)  # needs no read
         epoll.register(self._turns, 0)  # tells when nobody reads any more
+        self._has_slept: Callable[[], bool] = lambda: True
+        self._has_spoken: Callable[[], bool] = lambda: False
+        if core is not None:  # else both sleep until they are woken
+            shared = core.turns_of(self.said.fd)
+            self._has_slept = partial(core.turn_given, shared)
+            self._has_spoken = partial(core.turn_over, shared)
         self._poll, self._rung = epoll.poll, (bell, select.EPOLLIN)
         files = (turns, bell, self.said.fd, self._told.fd)
         # Of one length: the environment lies on the stack, and what comes after it moves.
@@ -221,7 +231,8 @@ class ProcessHandle:
             told.grow(size)
         told.data[:size] = data
         try:
-            _write(self._turns, _TURN)
+            if self._has_slept():
+                _write(self._turns, _TURN)
         except BrokenPipeError:
             pass
 
@@ -231,10 +242,12 @@ class ProcessHandle:
         :raises WireError: if the process has written something of its own to the link.
         """
         looks = 0
-        while True:
+        while not self._has_spoken():
             events = self._poll(_LOOK_S, 2)
             if self._rung in events:
-                return self.said.batch()
+                if core is None:
+                    break
+                continue
             # A process may be gone whose children have its end of the link.
             if events or self._process.poll() is not None:
                 return None
@@ -242,6 +255,7 @@ class ProcessHandle:
             if looks > self._patience:
                 self.kill()
                 return None
+        return self.said.batch()
 
     def give_up_after(self, seconds: float) -> None:
         """Kill the process if it says nothing for so long, by its own time (``Life``)."""

@@ -20,6 +20,7 @@
 #include "guard_conditions.h"
 #include "shared.h"
 #include "threads.h"
+#include "turns.h"
 
 namespace rsltrace {
 
@@ -43,11 +44,11 @@ __constinit Shared said;
 // What the loop has said last.
 __constinit Shared told;
 
-std::atomic<std::uint64_t> &length_said() {
-  return *reinterpret_cast<std::atomic<std::uint64_t> *>(said.data);
-}
+Turns &turns() { return *reinterpret_cast<Turns *>(said.data); }
 
-constexpr std::size_t LENGTH = sizeof(std::uint64_t);
+std::atomic<std::uint64_t> &length_said() { return turns().length; }
+
+constexpr std::size_t LENGTH = sizeof(Turns);
 
 [[noreturn]] void leave(int status) {
   syscall(SYS_exit_group, status);
@@ -58,6 +59,8 @@ constexpr std::size_t LENGTH = sizeof(std::uint64_t);
 [[noreturn]] void lost() { leave(120); }
 
 void send_batch() {
+  turns().batches.fetch_add(1);
+  if (turns().loop_sleeps.exchange(0) == 0 && turns().may_spin != 0) return;
   constexpr std::uint64_t once = 1;
   while (syscall(SYS_write, said_fd, &once, sizeof once) < 0) {
     if (errno != EINTR) lost();
@@ -72,12 +75,14 @@ struct Message {
 
 // Return the next thing that the loop says; it stays readable until the next call.
 Message listen() {
-  char byte;
-  long got;
-  do {
-    got = syscall(SYS_read, turn_fd, &byte, 1);
-  } while (got < 0 && errno == EINTR);
-  if (got != 1) lost();
+  if (!has_turn(turns())) {
+    char byte;
+    long got;
+    do {
+      got = syscall(SYS_read, turn_fd, &byte, 1);
+    } while (got < 0 && errno == EINTR);
+    if (got != 1) lost();
+  }
   std::uint32_t head[2];
   std::memcpy(head, told.data, sizeof head);
   if (sizeof head + head[0] > told.size && !told.look_again()) lost();
