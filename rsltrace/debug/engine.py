@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 _LOOK_EVERY = 64
 _LOOK_S = 0.05
 _NEVER = 1 << 62
-_cpu_s: Callable[[], float] = copy_of(time.process_time)  # type: ignore[arg-type]
-_getpid: Callable[[], int] = copy_of(os.getpid)  # type: ignore[arg-type]
+_cpu_s: Callable[[], float] = copy_of(time.process_time)
+_getpid: Callable[[], int] = copy_of(os.getpid)
 
 
 class ForkedCopy(NamedTuple):

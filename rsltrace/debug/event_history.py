@@ -27,9 +27,9 @@ from rsltrace.trace.writer import TraceWriter
 _ROW_BYTES = 8 + EVENT_REST.size
 _ROWS_AT_ONCE = 4096
 # Not those that a node's guard redirects: they are called in the middle of a run.
-_pread = copy_of(os.pread)  # type: ignore[arg-type]
-_pwrite = copy_of(os.pwrite)  # type: ignore[arg-type]
-_fstat = copy_of(os.fstat)  # type: ignore[arg-type]
+_pread = copy_of(os.pread)
+_pwrite = copy_of(os.pwrite)
+_fstat = copy_of(os.fstat)
 
 
 class TraceHistory:

@@ -17,7 +17,7 @@ _IN_A_ROW_MAX = 20
 _LAG_NS_MAX = 100_000_000
 """A slow run catches up, but minutes of computing do not count as minutes of waiting."""
 
-_real_ns = copy_of(time.monotonic_ns)  # type: ignore[arg-type]
+_real_ns = copy_of(time.monotonic_ns)
 
 
 class RealTimePace:

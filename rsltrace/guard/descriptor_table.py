@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.finding import NondeterminismSource
 
-_fstat = copy_of(os.fstat)  # type: ignore[arg-type]
+_fstat = copy_of(os.fstat)
 _Identity = tuple[int, int]
 
 

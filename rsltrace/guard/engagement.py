@@ -7,7 +7,7 @@ from typing import Any
 
 from rsltrace.guard.redirect import copy_of
 
-thread_id = copy_of(threading.get_ident)  # type: ignore[arg-type]
+thread_id = copy_of(threading.get_ident)
 _engaged: list[Any] = []
 
 

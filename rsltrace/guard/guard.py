@@ -51,7 +51,7 @@ from rsltrace.trace.model.finding import (
     NondeterminismSource,
 )
 
-_process_id = copy_of(os.getpid)  # type: ignore[arg-type]
+_process_id = copy_of(os.getpid)
 _guards: WeakKeyDictionary[Guard, None] = WeakKeyDictionary()  # no set: a run puts those in order
 
 FINDINGS_PER_EVENT = 100

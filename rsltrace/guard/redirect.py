@@ -91,6 +91,7 @@ class Redirected:
     def _turn(
         self, function: BuiltinFunctionType, target: object, address: int | None, flags: int
     ) -> None:
+        _check_is_built_in(function)
         self._function = function
         self._target = target
         self.real = copy_of(function)
@@ -124,6 +125,7 @@ class RedirectedReader(Redirected):
 
 def has_no_arguments(function: BuiltinFunctionType) -> bool:
     """Return whether a built-in function takes no arguments, so ``RedirectedReader`` fits."""
+    _check_is_built_in(function)
     definition = _Function.from_address(id(function)).definition
     return bool(_MethodDef.from_address(definition).flags == _NO_ARGUMENTS)
 
@@ -193,11 +195,14 @@ def redirect_function(
                 replace_attribute(stack, owner, name, replacement)
 
 
-def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:
+def copy_of(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a second function object that does what ``function`` does now.
 
-    Of a redirected function this is its target, because its definition will be gone.
+    Of a redirected function this is its target, because its definition will be gone; what is not
+    built in (a tool has replaced it) is never redirected, and its own copy.
     """
+    if not isinstance(function, BuiltinFunctionType):
+        return function
     place = _Function.from_address(id(function))
     definition = place.definition
     calls = _MethodDef.from_address(definition).function if definition else None
@@ -222,6 +227,17 @@ def method_of(kind: type, name: str, function: Any) -> Callable[..., Any]:
 
 
 _kept: list[_MethodDef] = []
+
+
+def _check_is_built_in(function: Any) -> None:
+    """Raise SetupError for what a tool has put in the place of a built-in function."""
+    if not isinstance(function, BuiltinFunctionType):
+        code = getattr(function, "__code__", None)
+        place = "" if code is None else f" ({code.co_filename}:{code.co_firstlineno})"
+        raise SetupError(
+            f"{getattr(function, '__name__', function)}() of this Python has been replaced{place} "
+            "before the run, so that it cannot be simulated: run rsltrace without what has done so"
+        )
 
 
 def _unknown_layout() -> SetupError:

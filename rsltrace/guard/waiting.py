@@ -33,9 +33,9 @@ _PROGRAM_S = 5.0
 _OF_A_PROGRAM = ("communicate", "_communicate", "_try_wait")
 """The functions of ``subprocess`` that wait for a program's output and end."""
 
-_poll = copy_of(select.poll)  # type: ignore[arg-type]
-_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
-_monotonic = copy_of(time.monotonic)  # type: ignore[arg-type]
+_poll = copy_of(select.poll)
+_sleep = copy_of(time.sleep)
+_monotonic = copy_of(time.monotonic)
 
 
 def wait_recorded(

@@ -132,7 +132,7 @@ class Life:
         return states, ticks * _TICK_S
 
 
-_write = copy_of(os.write)  # type: ignore[arg-type]  # these are not what the guard gives nodes
+_write = copy_of(os.write)  # these are not what the guard gives nodes
 _epoll: Any = getattr(select, "epoll", None)  # Linux has it, and only there are processes run
 _TURN = b"\0"
 _LOOK_S = 0.2

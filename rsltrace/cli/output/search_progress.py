@@ -70,7 +70,7 @@ def _killed_by_third() -> Iterator[None]:
     reading, writing = map(PrivateDescriptor, os.pipe())
     os.set_blocking(writing.number, False)
     wake_up = copy_of(_signal.set_wakeup_fd)  # not that of nodes
-    read = copy_of(os.read)  # type: ignore[arg-type]
+    read = copy_of(os.read)
 
     def count() -> None:
         came = 0

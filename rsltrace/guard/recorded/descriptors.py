@@ -34,9 +34,9 @@ _TERMINAL = (
     *("tcgetattr", "tcsetattr", "tcsendbreak", "tcdrain", "tcflush", "tcflow"),
     *("tcgetwinsize", "tcsetwinsize"),
 )
-_real_fstat = copy_of(os.fstat)  # type: ignore[arg-type]
-_isatty = copy_of(os.isatty)  # type: ignore[arg-type]
-_get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
+_real_fstat = copy_of(os.fstat)
+_isatty = copy_of(os.isatty)
+_get_blocking = copy_of(os.get_blocking)
 
 
 def recording_guard(source: NondeterminismSource, frame: FrameType) -> Guard | None:

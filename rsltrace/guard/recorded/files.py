@@ -35,7 +35,7 @@ from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 _FILE = NondeterminismSource.FILE
 _RECORD, _ALLOW = GuardMode.RECORD, GuardMode.ALLOW
 _TERMINALS = "/dev/pts/"
-_isatty = copy_of(os.isatty)  # type: ignore[arg-type]
+_isatty = copy_of(os.isatty)
 BYTES_MAX = 64 << 20
 
 
@@ -129,7 +129,7 @@ def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[...,
     return open_raw(RawDescriptor(number, mode, name=file), mode, *text)
 
 
-_real_stat = copy_of(os.stat)  # type: ignore[arg-type]
+_real_stat = copy_of(os.stat)
 
 
 def _recording_stat(name: str, real: Callable[..., Any]) -> Any:

@@ -41,14 +41,14 @@ REAL_TIME_MODULES = {
 simulated time."""
 
 
-_wall_ns = copy_of(time.time_ns)  # type: ignore[arg-type]
+_wall_ns = copy_of(time.time_ns)
 _REAL_NS = {
     name: copy_of(getattr(time, f"{name}_ns"))
     for name in ("monotonic", "perf_counter", "process_time", "thread_time")
 }
 
 _monotonic_ns = _REAL_NS["monotonic"]
-_real_gettime_ns = copy_of(time.clock_gettime_ns)  # type: ignore[arg-type]
+_real_gettime_ns = copy_of(time.clock_gettime_ns)
 
 
 def clock_call(
@@ -260,7 +260,7 @@ def virtual_clocks() -> Iterator[None]:
 
         for name in (*_READERS, *(f"{name}_ns" for name in _READERS)):
             redirect_time(name, partial(_reading, name), redirect_reader)
-        localtime = copy_of(time.localtime)  # type: ignore[arg-type]
+        localtime = copy_of(time.localtime)
         redirect_time(
             "clock_gettime", lambda real: _clock_gettime("clock_gettime", lambda ns: ns / _NS, real)
         )

@@ -21,7 +21,7 @@ from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.guard.rules import PROCESSOR_NAMES, PROCESSORS
 from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
-_getpid = copy_of(os.getpid)  # type: ignore[arg-type]
+_getpid = copy_of(os.getpid)
 _affinities: WeakKeyDictionary[Guard, frozenset[int]] = WeakKeyDictionary()
 """The processors that user code has set."""
 

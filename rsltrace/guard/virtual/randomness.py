@@ -40,7 +40,7 @@ _NODE_ID = 0x02_00_00_00_00_01
 """A locally administered MAC address, for ``uuid1`` and ``getnode``."""
 
 
-_real_entropy = copy_of(os.urandom)  # type: ignore[arg-type]
+_real_entropy = copy_of(os.urandom)
 
 
 _Virtual = Callable[[Guard, str], Callable[..., Any]]

@@ -272,12 +272,12 @@ _TRACES = (b"N3tbb6detail2r1", b"N3tbb8internal")
 _LOOKED_THROUGH_MAX = 64 << 20
 _SUFFIXES = tuple(EXTENSION_SUFFIXES)
 
-_dlopen: Callable[..., int] = copy_of(_ctypes.dlopen)  # type: ignore[arg-type]
-_dlsym: Callable[..., int] = copy_of(_ctypes.dlsym)  # type: ignore[arg-type]
+_dlopen: Callable[..., int] = copy_of(_ctypes.dlopen)
+_dlsym: Callable[..., int] = copy_of(_ctypes.dlsym)
 _HAS_AFFINITY = hasattr(os, "sched_setaffinity")
 if _HAS_AFFINITY:
-    _may_use = copy_of(os.sched_getaffinity)  # type: ignore[arg-type]
-    _use = copy_of(os.sched_setaffinity)  # type: ignore[arg-type]
+    _may_use = copy_of(os.sched_getaffinity)
+    _use = copy_of(os.sched_setaffinity)
 
 _without: set[str] = set()
 """Files of this process that are known to have no TBB."""

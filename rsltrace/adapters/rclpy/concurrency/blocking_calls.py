@@ -38,7 +38,7 @@ POLL_NS = 1_000_000
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
-getpid = copy_of(os.getpid)  # type: ignore[arg-type]  # not the one that the guard watches
+getpid = copy_of(os.getpid)  # not the one that the guard watches
 _PATIENCE = 100
 """How often a stack may wait after the end of the run before it is abandoned."""
 
@@ -273,7 +273,7 @@ _RATE = (
     "the next period of a Rate, which is a timer of its node: an executor has to spin the node "
     "meanwhile, in another thread"
 )
-_real_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
+_real_sleep = copy_of(time.sleep)
 runtimes: list[Runtime] = []
 """Those of the runs in this process, or in the process that forked it."""
 

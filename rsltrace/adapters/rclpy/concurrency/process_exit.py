@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import _signal  # type: ignore[import-not-found]
 import os
+import posix
 import signal
 import sys
 import threading
@@ -164,11 +165,11 @@ _real: dict[str, Callable[..., Any]] = {}
 def own_process_ends(runtime: Runtime) -> Iterator[None]:
     """Let nodes end their simulated process only, within the ``with`` block."""
     targets: list[tuple[Any, Callable[..., Any]]] = [
-        (os._exit, _exit),
-        (os.abort, _abort),
-        (os.kill, _kill),
-        (os.execv, _execv),
-        (os.execve, _execve),
+        (posix._exit, _exit),  # a tool may have replaced those of os
+        (posix.abort, _abort),
+        (posix.kill, _kill),
+        (posix.execv, _execv),
+        (posix.execve, _execve),
         (_signal.raise_signal, _raise_signal),
     ]
     before = dict(_real)

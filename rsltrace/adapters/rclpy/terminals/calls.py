@@ -232,9 +232,9 @@ def _halving(all_ms: list[int], real: Callable[[int], Any]) -> Callable[[int], A
 
 
 _STEP_NS = 1_000_000
-_dup = copy_of(os.dup)  # type: ignore[arg-type]
-_dup2 = copy_of(os.dup2)  # type: ignore[arg-type]
-_close = copy_of(os.close)  # type: ignore[arg-type]
+_dup = copy_of(os.dup)
+_dup2 = copy_of(os.dup2)
+_close = copy_of(os.close)
 
 
 class Terminals:

@@ -27,13 +27,13 @@ _END = b"\x04"
 _LOCAL_MODES = 3
 _SIZE = (24, 80)
 """Lines and columns."""
-_openpty = copy_of(os.openpty)  # type: ignore[arg-type]
-_read = copy_of(os.read)  # type: ignore[arg-type]
-_write = copy_of(os.write)  # type: ignore[arg-type]
-_close = copy_of(os.close)  # type: ignore[arg-type]
-_poll = copy_of(select.poll)  # type: ignore[arg-type]
-_tcgetattr = copy_of(termios.tcgetattr)  # type: ignore[arg-type]
-_get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
+_openpty = copy_of(os.openpty)
+_read = copy_of(os.read)
+_write = copy_of(os.write)
+_close = copy_of(os.close)
+_poll = copy_of(select.poll)
+_tcgetattr = copy_of(termios.tcgetattr)
+_get_blocking = copy_of(os.get_blocking)
 
 
 class Terminal:
