@@ -133,8 +133,12 @@ def test_a_gate_or_least_step_that_a_callback_sets_counts_at_once() -> None:
     log: list[object] = []
     loop = make_loop(between_steps=lambda: 1000)
 
+    def gate(next_ns: int | None) -> bool:
+        log.append(next_ns)
+        return False
+
     def shut() -> None:
-        loop.gate = lambda next_ns: bool(log.append(next_ns))  # type: ignore[func-returns-value]
+        loop.gate = gate
 
     def step() -> None:
         loop.gate, loop.min_step_ns = None, 10
