@@ -862,9 +862,14 @@ static PyMethodDef dispatcher_methods[] = {
 /* -- Publisher ---------------------------------------------------------------------------------- */
 
 int append_to(PyObject *queue, PyObject *item) {
+  int failed;
+  Py_INCREF(queue);
   if ((PyObject *)Py_TYPE(queue) == deque_type)
-    return done(PyObject_CallFunctionObjArgs(deque_append, queue, item, NULL));
-  return done(PyObject_CallMethod(queue, "append", "(O)", item));
+    failed = done(PyObject_CallFunctionObjArgs(deque_append, queue, item, NULL));
+  else
+    failed = done(PyObject_CallMethod(queue, "append", "(O)", item));
+  Py_DECREF(queue);
+  return failed;
 }
 
 /* Whether a queue has as many items as it keeps. */
@@ -908,10 +913,10 @@ static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
 
 static int deliver_to_all(Entity *self, PyObject *delivery, Loop *loop) {
   PyObject *all = Py_NewRef(self->subscriptions);
-  int failed = 0;
+  int failed = PyList_Size(all) < 0;
   for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
     PyObject *subscription = Py_NewRef(PyList_GetItem(all, i));
-    failed = deliver(subscription, delivery, loop);
+    failed = deliver(subscription, delivery, loop) < 0;
     Py_DECREF(subscription);
   }
   Py_DECREF(all);
@@ -920,7 +925,7 @@ static int deliver_to_all(Entity *self, PyObject *delivery, Loop *loop) {
 
 static int send_over_links(Entity *self, PyObject *delivery) {
   PyObject *all = Py_NewRef(self->links);
-  int failed = 0;
+  int failed = PyList_Size(all) < 0;
   for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
     PyObject *link = Py_NewRef(PyList_GetItem(all, i));
     failed = send_over(link, delivery) < 0;
@@ -937,7 +942,10 @@ static int record_message(Entity *self, PyObject *recorder, PyObject *now_ns, Py
   *digest = content_hash != Py_None ? Py_NewRef(content_hash)
                                     : PyObject_CallFunctionObjArgs(hash64, data, NULL);
   kind = *digest == NULL ? NULL : PyObject_GetAttr((PyObject *)self, output_kind);
-  if (kind == NULL) return -1;
+  if (kind == NULL || !is_publisher((PyObject *)self)) {
+    Py_XDECREF(kind);
+    return -1;
+  }
   row[0] = kind;
   row[1] = Py_NewRef(self->entity_id);
   row[2] = Py_NewRef(self->channel);
@@ -973,18 +981,19 @@ static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
   if (!failed) now_ns = Py_NewRef(loop->now_ns);
   failed = failed || add_one(&self->count) < 0;
   if (!failed && recorder != Py_None) {
-    failed = record_message(self, recorder, now_ns, data, content_hash, &digest, &position) < 0 ||
-             !HAS_FIELDS(loop, Loop, loop) || !is_publisher((PyObject *)self);
+    failed = record_message(self, recorder, now_ns, data, content_hash, &digest, &position) < 0;
   } else if (!failed) {
     failed = add_one(&dispatcher->unrecorded);
     digest = Py_NewRef(zero);
     position = Py_NewRef(zero);
   }
+  failed = failed || !HAS_FIELDS(loop, Loop, loop) || !is_publisher((PyObject *)self);
   if (!failed) {
     delivery = delivery_of(loop, now_ns, data, digest, position, self->count);
     failed = delivery == NULL || set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 ||
+             !is_publisher((PyObject *)self) ||
              (self->links == Py_None ? deliver_to_all(self, delivery, loop)
-                                     : send_over_links(self, delivery)) < 0;
+                                     : send_over_links(self, delivery));
   }
   Py_XDECREF(now_ns);
   Py_XDECREF(delivery);

@@ -101,10 +101,9 @@ static int draw_delay(Link *self, PyObject *leaves_ns, PyObject **delay_ns, PyOb
   *delay_ns = PyObject_CallFunctionObjArgs(sampler, leaves_ns, NULL);
   Py_DECREF(sampler);
   if (*delay_ns == NULL || !is_plain((PyObject *)self)) return -1;
-  *arrival_ns = PyNumber_Add(leaves_ns, *delay_ns);
-  if (*arrival_ns == NULL) return -1;
   last_ns = Py_NewRef(self->last_ns);
-  is_early = PyObject_RichCompareBool(*arrival_ns, last_ns, Py_LT);
+  *arrival_ns = PyNumber_Add(leaves_ns, *delay_ns);
+  is_early = *arrival_ns == NULL ? -1 : PyObject_RichCompareBool(*arrival_ns, last_ns, Py_LT);
   if (is_early > 0 && (set(arrival_ns, Py_NewRef(last_ns)) < 0 ||
                        set(delay_ns, PyNumber_Subtract(last_ns, leaves_ns)) < 0))
     is_early = -1;
@@ -135,27 +134,29 @@ static int record_delay(Link *self, PyObject *delay_ns) {
 
 static PyObject *release_of(Link *self, WholeLoop *loop, PyObject *arrival_ns,
                             PyObject *const *message) {
-  PyObject *next_place = Py_NewRef(loop->next_place), *release = NULL;
+  PyObject *next_place = Py_NewRef(loop->next_place), *arrive = NULL, *release = NULL;
   PyObject *place = PyObject_CallObject(next_place, NULL);
   Py_DECREF(next_place);
-  if (place != NULL && is_plain((PyObject *)self)) release = PyTuple_New(10);
+  if (place != NULL && is_plain((PyObject *)self)) arrive = Py_NewRef(self->arrive);
+  if (arrive != NULL) release = PyTuple_New(10); /* may collect garbage: see delivery_of */
   if (release != NULL) {
     PyTuple_SetItem(release, 0, Py_NewRef(arrival_ns));
     PyTuple_SetItem(release, 1, Py_NewRef(order_release));
     PyTuple_SetItem(release, 2, Py_NewRef(place));
-    PyTuple_SetItem(release, 3, Py_NewRef(self->arrive));
+    PyTuple_SetItem(release, 3, Py_NewRef(arrive));
     for (int i = 0; i < 6; ++i) PyTuple_SetItem(release, 4 + i, Py_NewRef(message[i]));
   }
+  Py_XDECREF(arrive);
   Py_XDECREF(place);
   return release;
 }
 
 /* Whether a message has to wait in the loop's queue. */
 static int is_later(Link *self, WholeLoop *loop, PyObject *delay_ns, PyObject *arrival_ns) {
-  PyObject *arrive, *expects;
+  PyObject *arrive, *expects, *now_ns = Py_NewRef(loop->of_events.now_ns);
   int is_it = PyObject_IsTrue(delay_ns);
-  if (is_it) return is_it;
-  is_it = PyObject_RichCompareBool(arrival_ns, loop->of_events.now_ns, Py_NE);
+  if (is_it == 0) is_it = PyObject_RichCompareBool(arrival_ns, now_ns, Py_NE);
+  Py_DECREF(now_ns);
   if (is_it || !is_plain((PyObject *)self)) return is_it ? is_it : -1;
   arrive = Py_NewRef(self->arrive);
   expects = PyObject_CallMethod((PyObject *)self, "expects", "O", arrive);
@@ -192,7 +193,8 @@ static int send_plainly(Link *self, PyObject *const *message) {
   if (!is_plain((PyObject *)self) || !is_loop(self->loop)) return -1;
   loop = (WholeLoop *)Py_NewRef(self->loop);
   leaves_ns = when_it_leaves(self, loop);
-  failed = leaves_ns == NULL || draw_delay(self, leaves_ns, &delay_ns, &arrival_ns) < 0 ||
+  failed = leaves_ns == NULL || !is_plain((PyObject *)self) ||
+           draw_delay(self, leaves_ns, &delay_ns, &arrival_ns) < 0 ||
            !is_plain((PyObject *)self) || record_delay(self, delay_ns) < 0 ||
            !is_loop((PyObject *)loop);
   if (!failed) release = release_of(self, loop, arrival_ns, message);
@@ -240,11 +242,21 @@ static PyMethodDef link_methods[] = {
 
 /* -- time steps ---------------------------------------------------------------------------------- */
 
-/* Returns a number, or the largest one in place of more; -1 with an error. */
-static long long number_of(PyObject *value) {
+/* Returns a number, or 2**63 in place of more; -1 with an error. */
+static __int128 number_of(PyObject *value) {
   int overflow;
+  Py_XINCREF(value);
   const long long number = PyLong_AsLongLongAndOverflow(value, &overflow);
-  return overflow > 0 ? INT64_MAX : number;
+  Py_XDECREF(value);
+  return overflow > 0 ? (__int128)INT64_MAX + 1 : number;
+}
+
+static Py_ssize_t size_of(PyObject *queue) {
+  Py_ssize_t size;
+  Py_XINCREF(queue);
+  size = PyObject_Size(queue);
+  Py_XDECREF(queue);
+  return size;
 }
 
 /* Returns the time of the first release, borrowed; NULL if there is none, or with an error. */
@@ -261,10 +273,10 @@ static PyObject *first_ns(WholeLoop *self) {
              : (PyErr_SetString(PyExc_TypeError, "what is scheduled is no release"), NULL);
 }
 
-static long long next_timer_ns(WholeLoop *self) {
+static __int128 next_timer_ns(WholeLoop *self) {
   PyObject *timers = Py_NewRef(self->timers);
   PyObject *value = PyObject_GetAttr(timers, next_ns_name);
-  const long long next_ns = value == NULL ? -1 : number_of(value);
+  const __int128 next_ns = value == NULL ? -1 : number_of(value);
   Py_XDECREF(value);
   Py_DECREF(timers);
   return next_ns;
@@ -273,17 +285,19 @@ static long long next_timer_ns(WholeLoop *self) {
 /* Whether the next arrival is all that the loop has to look at; -1 with an error. */
 static int is_next(WholeLoop *self) {
   PyObject *time = first_ns(self);
-  long long next_ns, timer_ns;
-  Py_ssize_t others = 0;
+  __int128 next_ns, timer_ns;
+  Py_ssize_t others;
   if (time == NULL) return PyErr_Occurred() ? -1 : 0;
-  PyObject *const queues[] = {self->of_events.ready, self->tasks, self->idle};
-  for (int i = 0; i < 3 && others == 0; ++i) others = PyObject_Size(queues[i]);
+  next_ns = number_of(time);
+  if (next_ns == -1 && PyErr_Occurred()) return -1;
+  others = size_of(self->of_events.ready);
+  if (others == 0) others = size_of(self->tasks);
+  if (others == 0) others = size_of(self->idle);
   if (others) return others < 0 ? -1 : 0;
   if (self->gate != Py_None) return 0;
-  next_ns = number_of(time);
   if (next_ns <= number_of(self->of_events.now_ns) || next_ns >= number_of(self->quiet_ns) ||
       number_of(self->of_events.events) >= number_of(self->until_events) ||
-      number_of(self->min_step_ns) != 0 || PyErr_Occurred())
+      number_of(self->min_step_ns) != 0 || PyErr_Occurred() || !is_loop((PyObject *)self))
     return PyErr_Occurred() ? -1 : 0;
   timer_ns = next_timer_ns(self);
   return PyErr_Occurred() ? -1 : next_ns < timer_ns;
@@ -363,8 +377,8 @@ int add_loop_types(PyObject *module) {
   send_name = PyUnicode_InternFromString("send");
   loop_type = loop_made(loop_fields, loop_methods);
   link_type = link_made(link_fields, link_methods);
-  if (heappush == NULL || heappop == NULL || first_draw == NULL || order_release == NULL || minus_one == NULL ||
-      next_ns_name == NULL || destroyed_name == NULL || popleft_name == NULL ||
+  if (heappush == NULL || heappop == NULL || first_draw == NULL || order_release == NULL ||
+      minus_one == NULL || next_ns_name == NULL || destroyed_name == NULL || popleft_name == NULL ||
       send_name == NULL || loop_type == NULL || link_type == NULL ||
       PyModule_AddObjectRef(module, "LoopFields", (PyObject *)loop_type) < 0)
     return -1;

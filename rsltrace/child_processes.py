@@ -10,9 +10,10 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from rsltrace.fast_dataclass import dataclass
 
 # No module is loaded from the working directory: not even ctypes. The kernel ends the process with
 # its parent (PR_SET_PDEATHSIG), whose number is the second word; "": it does not.

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import os
 import stat
-from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.finding import NondeterminismSource
 

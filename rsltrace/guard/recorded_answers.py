@@ -13,10 +13,10 @@ import socket
 import ssl
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.errors import GuardError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.finding import Finding, GuardMode
 
 # Clocks and random functions, as far as counts and further answers need them.

@@ -10,12 +10,13 @@ import os
 import re
 import resource
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.finding import MODES, GuardMode, GuardPolicy, NondeterminismSource
 
 PROCESSORS = 4

@@ -8,7 +8,6 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
 
@@ -16,6 +15,7 @@ from greenlet import getcurrent
 
 from rsltrace.child_processes import how_ended
 from rsltrace.errors import RunError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.forking import (
     Pairs,
     end_process,

@@ -9,7 +9,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.adapters.rclpy.messages.interface_classes import forget_interfaces
 from rsltrace.adapters.workspace.imports import unbuilt_packages
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.callers import is_rsltrace_module
 from rsltrace.guard.guard import engage
 from rsltrace.job import Job

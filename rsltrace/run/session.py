@@ -9,12 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.adapters.processes.adapter import ProcessAdapter
 from rsltrace.errors import BagError, DeadlockError, RunError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job import Job
 from rsltrace.run.inputs import check_output, expand_launch_files
 from rsltrace.run.plans.bags import (

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from rsltrace.errors import JobError, RunError, nearest
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job import Job, locate, showing_line
 from rsltrace.job.parts.stop import TopicStop
 from rsltrace.job.values.times import TimeInRun, format_size

@@ -11,9 +11,9 @@ import json
 import re
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from rsltrace.errors import OutputError
+from rsltrace.fast_dataclass import dataclass
 
 BAG_METADATA_VERSION = 9
 FILE_NAME = "trace.mcap"

@@ -117,13 +117,38 @@ def test_stop_ends_at_once_and_stop_after_step_does_not() -> None:
 
 def test_what_is_due_after_the_end_of_time_never_is() -> None:
     log: list[str] = []
-    for options in ({}, {"stop_conditions": (lambda progress: None,)}):
-        loop = make_loop(**options)
-        loop.schedule(2**63 - 1, lambda: log.append("last"))
-        loop.schedule(2**63, lambda: log.append("too late"))
-        assert loop.run() == Stop("what is due next is beyond 2**63 ns, where ROS's time ends")
-        assert loop.now_ns == 2**63 - 1
-    assert log == ["last", "last"]
+    conditions: list[object] = [(), (lambda progress: None,), (stop_at(2**64, "end"),)]
+    for stop_conditions in conditions:
+        for pause_events in (0, 1000):
+            loop = make_loop(stop_conditions=stop_conditions, between_steps=lambda: pause_events)  # noqa: B023
+            loop.schedule(1, lambda: log.append("first"))
+            loop.schedule(2**63 - 1, lambda: log.append("last"))
+            loop.schedule(2**63, lambda: log.append("too late"))
+            assert loop.run() == Stop("what is due next is beyond 2**63 ns, where ROS's time ends")
+            assert loop.now_ns == 2**63 - 1
+    assert log == ["first", "last"] * 6
+
+
+def test_a_gate_or_least_step_that_a_callback_sets_counts_at_once() -> None:
+    log: list[object] = []
+    loop = make_loop(between_steps=lambda: 1000)
+
+    def gate(next_ns: int | None) -> bool:
+        log.append(next_ns)
+        return False
+
+    def shut() -> None:
+        loop.gate = gate
+
+    def step() -> None:
+        loop.gate, loop.min_step_ns = None, 10
+
+    for time_ns, action in ((1, lambda: None), (2, shut), (3, step), (4, lambda: None)):
+        loop.schedule(time_ns, action)
+        loop.schedule(time_ns, lambda: log.append(loop.now_ns))
+    loop.schedule(4, lambda: None)
+    loop.run()
+    assert log == [1, 2, 3, 3, 13]
 
 
 def test_the_step_at_the_stop_time_runs_whatever_else_is_asked() -> None:

@@ -428,6 +428,71 @@ def test_a_broken_link_or_loop_is_refused() -> None:
 
 
 @needs_core
+def test_what_a_link_raises_comes_out_of_send() -> None:
+    run = DelayedRun(4, compiled=True)
+    publisher = run.publishers[0]
+    publisher.send(b"it opens the channel")
+    link: Any = (publisher.links or [])[0]
+    link._delay = lambda leaves_ns: 1 // 0
+    with pytest.raises(ZeroDivisionError):
+        publisher.send(b"1")
+
+
+class Looking(int):
+    """A number that acts when somebody computes with it, or nobody needs it any more."""
+
+    act: Any = None
+
+    def look(self, *_: object) -> Any:
+        act, self.act = self.act, None
+        if act is not None:
+            with suppress(AttributeError):
+                act()
+        return NotImplemented
+
+    __add__ = __radd__ = __lt__ = __gt__ = __ne__ = __del__ = look
+    __hash__ = int.__hash__
+
+    def __bool__(self) -> bool:
+        return self.look() is None
+
+
+@needs_core
+def test_a_field_that_goes_while_another_is_looked_at_is_no_crash() -> None:
+    code = (
+        "from contextlib import suppress\n"
+        "from tests.middleware.test_compiled import DelayedRun, Looking\n"
+        "def parts_of(seed):\n"
+        "    run = DelayedRun(seed, compiled=True)\n"
+        "    publisher = run.publishers[0]\n"
+        "    publisher.send(b'it opens the channel')\n"
+        "    run.loop._until_events, run.loop._quiet_ns = 1000, 2**63\n"
+        "    run.loop.ready.clear()\n"
+        "    return run.dispatcher.event, run.loop, publisher, run.dispatcher, publisher.links[0]\n"
+        "looked_at = list(enumerate(('busy_ns', 'now_ns', '_count', 'unrecorded', 'last_ns')))\n"
+        "gone = [\n"
+        "    (1, 'scheduled timers now_ns events ready next_place'),\n"
+        "    (2, 'links subscriptions _count entity_id _channel'),\n"
+        "    (4, 'subscription _loop _dispatcher last_ns _delay _arrives'),\n"
+        "]\n"
+        "for seed in (3, 5):\n"
+        "    for number, field in looked_at:\n"
+        "        for owner, names in gone:\n"
+        "            for name in names.split():\n"
+        "                parts = parts_of(seed)\n"
+        "                looking = Looking(getattr(parts[number], field))\n"
+        "                looking.act = lambda: delattr(parts[owner], name)\n"
+        "                setattr(parts[number], field, looking)\n"
+        "                del looking\n"
+        "                with suppress(AttributeError, TypeError, SystemError):\n"
+        "                    parts[2].send(b'1')\n"
+        "                with suppress(AttributeError, TypeError):\n"
+        "                    parts[1].next_arrival()\n"
+    )
+    subprocess.run([sys.executable, "-X", "dev", "-c", code], cwd=ROOT, check=True)
+
+
+@needs_core
 def test_a_run_leaves_no_memory_behind() -> None:
     code = (
         "import gc, random, resource, weakref\n"

@@ -10,7 +10,6 @@ import struct
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from rsltrace.adapters.processes.wire import RECORD, CommandKind, WireError
 from rsltrace.child_processes import how_ended, kill_group
 from rsltrace.compiled import core
 from rsltrace.errors import JobError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.pin import fix_addresses
 from rsltrace.guard.redirect import copy_of
 

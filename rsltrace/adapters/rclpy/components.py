@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.adapters.rclpy.arguments import RosArguments
 from rsltrace.adapters.rclpy.messages.interfaces import get_service_class
 from rsltrace.errors import JobError, RunError, SetupError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.middleware.participant import full_name
 
 _TYPE = "composition_interfaces/srv/LoadNode"

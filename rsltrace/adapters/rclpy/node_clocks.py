@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.chance.stream import ClockModel, RandomStream, SkewedClock
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.trace.model.event import encode_clock_change

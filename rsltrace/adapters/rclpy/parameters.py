@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.middleware.graph import Graph
 
 

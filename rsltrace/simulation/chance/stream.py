@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator
-from dataclasses import dataclass
 from fractions import Fraction
 from hashlib import blake2b, shake_128
 from itertools import accumulate, chain
@@ -16,6 +15,7 @@ from itertools import accumulate, chain
 import numpy as np
 import numpy.typing as npt
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.chance.portable_math import log
 
 _BLOCK_BYTES = 8 * 64

@@ -217,7 +217,6 @@ class EventLoop(LoopFields):
         ready = self.ready
         timers = self.timers
         idle = self.idle
-        quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
         self.looks_at = -1
         while True:
             # Time steps with one arrival and nothing else due.
@@ -258,6 +257,7 @@ class EventLoop(LoopFields):
                 return
             if self.now_ns != now_ns:  # a callback has waited, and others have gone on meanwhile
                 return
+            quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
             next_ns = timers.next_ns
             if scheduled and scheduled[0][0] < next_ns:
                 next_ns = scheduled[0][0]

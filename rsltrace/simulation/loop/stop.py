@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
+
+from rsltrace.fast_dataclass import dataclass
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +57,9 @@ def stop_at(time_ns: int, reason: str, exit_code: int = 0) -> StopCondition:
 
 
 def quiet_until_ns(conditions: tuple[StopCondition, ...]) -> int:
-    """Return the time before which none of the conditions needs to be asked."""
-    never_asked = 2**63
-    return min((getattr(c, "quiet_until_ns", -1) for c in conditions), default=never_asked)
+    """Return the time before which none of the conditions needs to be asked; 2**63, where time
+    ends, is the latest."""
+    return min([2**63, *(getattr(c, "quiet_until_ns", -1) for c in conditions)])
 
 
 def stop_after_events(count: int) -> StopCondition:

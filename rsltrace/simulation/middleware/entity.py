@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
 from rsltrace.compiled import EntityFields
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import callback_source
 from rsltrace.trace.model.entity import Entity, EntityKind

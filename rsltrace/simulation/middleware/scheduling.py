@@ -4,10 +4,10 @@ execution times, which keep workers busy and delay what a callback sends."""
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.chance.distribution import Distribution, Sampler
 from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.ordered import OrderedLoop, ReadyItem, SimulatedExecutor

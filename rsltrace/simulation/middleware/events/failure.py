@@ -9,11 +9,11 @@ import contextlib
 import os
 import traceback
 from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
 
 from rsltrace.errors import NodeError, RunError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher

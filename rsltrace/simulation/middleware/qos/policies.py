@@ -7,9 +7,11 @@ https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Quality-of-Service-Set
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any
+
+from rsltrace.fast_dataclass import dataclass
 
 
 class Reliability(IntEnum):
