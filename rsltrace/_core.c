@@ -419,7 +419,7 @@ static int put(uint8_t *row, PyObject *value, uint64_t most, size_t size) {
   return number <= most;
 }
 
-static PyObject *attribute_of(const char *module_name, const char *name) {
+PyObject *attribute_of(const char *module_name, const char *name) {
   PyObject *module = PyImport_ImportModule(module_name), *found;
   if (module == NULL) return NULL;
   found = PyObject_GetAttrString(module, name);

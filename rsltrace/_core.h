@@ -128,6 +128,7 @@ static inline __attribute__((always_inline)) int has_fields(
 /* Replaces a field by a new object, or fails if there is none. */
 int set(PyObject **field, PyObject *value);
 
+PyObject *attribute_of(const char *module_name, const char *name);
 int done(PyObject *result);
 int append_to(PyObject *queue, PyObject *item);
 int record_draw(PyObject *recorder, PyObject *entity, PyObject *draw);

@@ -357,14 +357,6 @@ static PyMethodDef loop_methods[] = {
     {NULL, NULL, 0, NULL},
 };
 
-static PyObject *attribute_of(const char *module_name, const char *name) {
-  PyObject *module = PyImport_ImportModule(module_name), *found;
-  if (module == NULL) return NULL;
-  found = PyObject_GetAttrString(module, name);
-  Py_DECREF(module);
-  return found;
-}
-
 int add_loop_types(PyObject *module) {
   heappush = attribute_of("heapq", "heappush");
   heappop = attribute_of("heapq", "heappop");
