@@ -35,7 +35,7 @@ bool is_contended() {
 }  // namespace
 
 bool has_turn(Turns &turns) {
-  static std::uint32_t next = 0, rests = 0, pause = 0, spun = 0;
+  static std::uint32_t next = 0, rests = 0, pause = 0, spun = 0, yields = LOOKS;
   ++next;
   if (turns.may_spin == 0) return false;
   const auto is_there = [&] {
@@ -49,7 +49,11 @@ bool has_turn(Turns &turns) {
       rests = pause = std::min(2 * pause + 1, PAUSE_MAX);
     } else {
       pause /= 2;
-      if (++spun % LOOKS == 0 && is_contended()) rests = pause = PAUSE_MAX;
+      if (++spun % LOOKS == 0) {
+        const bool is = is_contended();
+        rests = is ? yields : 0;
+        yields = is ? std::min(2 * yields, PAUSE_MAX) : std::max(yields / 2, LOOKS);
+      }
     }
   }
   if (is_there()) return true;
