@@ -30,7 +30,7 @@ _LIBRARIES = (
     "rcl", "rcutils", "rcl_yaml_param_parser", "rosidl_runtime_c", "tracetools",
     "std_msgs__rosidl_typesupport_c", "std_msgs__rosidl_generator_c",
 )  # fmt: skip
-_MAX_US = 30.0
+_MAX_US = 15.0
 SCRIPT = """
 import sys
 import rclpy
