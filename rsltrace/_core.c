@@ -611,7 +611,7 @@ static PyTypeObject *sites_type, *chain_type;
 static PyObject *sites_seen, *publisher_seen, *node_seen, *chain_seen;
 static PyObject *deque_type, *deque_append, *deque_popleft, *hash64, *zero, *output_kind;
 static PyObject *call_back;
-static PyObject *callback_group, *active_entity, *user_callback, *raw;
+static PyObject *callback_group, *active_entity, *user_callback, *raw, *admitted;
 
 FIELDS(Event, event)
 FIELDS(Dispatcher, dispatcher)
@@ -1086,12 +1086,10 @@ static int is_free(PyObject *wrapper) {
 /* Whether the next arrival is a message for a plain function that may run now; -1 with an error. */
 static int is_usual(Entity *self) {
   PyObject *wrapper = self->wrapper, *callback = self->callback;
-  Entity *node = (Entity *)self->node;
   int usual = 0;
-  if (node == NULL || !is_a((PyObject *)node, entity_type, &node_seen) ||
-      node->mailbox != Py_None || self->queue == NULL ||
-      (PyObject *)Py_TYPE(self->queue) != deque_type || PyObject_Length(self->queue) == 0 ||
-      self->destroyed != Py_False || self->own_group != Py_False || self->coroutine != Py_False ||
+  if (self->queue == NULL || (PyObject *)Py_TYPE(self->queue) != deque_type ||
+      PyObject_Length(self->queue) == 0 || self->destroyed != Py_False ||
+      self->own_group != Py_False || self->coroutine != Py_False ||
       self->with_info != Py_False || wrapper == NULL || callback == NULL)
     return 0;
   Py_INCREF(wrapper);
@@ -1104,6 +1102,22 @@ static int is_usual(Entity *self) {
   if (usual >= 0 || !PyErr_ExceptionMatches(PyExc_AttributeError)) return usual;
   PyErr_Clear();
   return 0;
+}
+
+/* Whether nobody but the loop runs the node, or the executor that does has taken this entity out of
+   its mailbox (Mailbox.keeps); -1 with an error. */
+static int is_admitted(Entity *self) {
+  Entity *node = (Entity *)self->node;
+  PyObject *mailbox;
+  int is_it;
+  if (node == NULL || !is_a((PyObject *)node, entity_type, &node_seen) || node->mailbox == NULL)
+    return 0;
+  if (node->mailbox == Py_None) return 1;
+  mailbox = Py_NewRef(node->mailbox);
+  is_it = has(mailbox, admitted, (PyObject *)self);
+  if (is_it > 0 && PyObject_SetAttr(mailbox, admitted, Py_None) < 0) is_it = -1;
+  Py_DECREF(mailbox);
+  return is_it;
 }
 
 /* Runs the callback for a delivery of the middleware (subscription.Delivery). */
@@ -1134,7 +1148,8 @@ static int run_subscription(Entity *self, PyObject *delivery) {
 static PyObject *subscription_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
   PyObject *delivery;
   int failed = 1;
-  const int usual = is_usual(self);
+  int usual = is_usual(self);
+  if (usual > 0) usual = is_admitted(self);
   if (usual < 0) return NULL;
   if (!usual || self->queue == NULL || self->callback == NULL || self->deserialize == NULL ||
       self->node == NULL || self->entity_id == NULL || self->dispatcher == NULL)
@@ -1175,6 +1190,7 @@ static int add_types(PyObject *module) {
   active_entity = PyUnicode_InternFromString("_active_entity");
   user_callback = PyUnicode_InternFromString("_callback");
   raw = PyUnicode_InternFromString("raw");
+  admitted = PyUnicode_InternFromString("admitted");
   draw_kind = PyLong_FromLong(DRAW);
   no_sequence = PyLong_FromUnsignedLong(U32);
   buffer_type = (PyTypeObject *)PyType_FromSpec(&buffer_spec);
@@ -1196,8 +1212,8 @@ static int add_types(PyObject *module) {
   };
   if (deque_append == NULL || deque_popleft == NULL || hash64 == NULL || zero == NULL ||
       output_kind == NULL || call_back == NULL || callback_group == NULL ||
-      active_entity == NULL || user_callback == NULL || raw == NULL || draw_kind == NULL ||
-      no_sequence == NULL)
+      active_entity == NULL || user_callback == NULL || raw == NULL || admitted == NULL ||
+      draw_kind == NULL || no_sequence == NULL)
     return -1;
   for (size_t i = 0; i < sizeof all / sizeof *all; ++i)
     if (all[i].object == NULL || PyModule_AddObjectRef(module, all[i].name, all[i].object) < 0)

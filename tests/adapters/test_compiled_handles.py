@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import gc
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import pytest
+import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import UInt64
 
+from rsltrace import NodeSpec
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.compiled import core
 from rsltrace.errors import RunError
@@ -87,10 +91,31 @@ def in_python(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PublisherHandle, "publish", PublisherHandle.publish_any)
 
 
-def test_callbacks_run_the_same(simulate: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def _turn_by_turn(node: Node) -> None:
+    while rclpy.ok():
+        rclpy.spin_once(node)
+
+
+def _in_threads(node: Node) -> None:
+    executor = MultiThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
+@pytest.mark.parametrize("spin", [None, rclpy.spin, _turn_by_turn, _in_threads])
+def test_callbacks_run_the_same(
+    simulate: Any, monkeypatch: pytest.MonkeyPatch, spin: Callable[[Node], None] | None
+) -> None:
     def run() -> tuple[list[Any], str]:
         log: list[Any] = []
-        result = simulate(lambda: Changes(log), duration=1).result
+
+        def main() -> None:
+            rclpy.init()
+            assert spin is not None
+            spin(Changes(log))
+
+        node = NodeSpec(node=lambda: Changes(log)) if spin is None else NodeSpec(main=main)
+        result = simulate(node, duration=1).result
         return log, result.digest
 
     compiled = run()
