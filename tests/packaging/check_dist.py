@@ -66,7 +66,7 @@ def check_contents(wheel: Path, sdist: Path) -> str:
     is_compiled = "rsltrace/_core.abi3.so" in names
     assert is_compiled != wheel.name.endswith("-py3-none-any.whl"), wheel.name
     code = {path.relative_to(ROOT) for path in (ROOT / "rsltrace").rglob("*") if path.is_file()}
-    sources = {path for path in code if path.suffix == ".c"}
+    sources = {path.relative_to(ROOT) for path in (ROOT / "rsltrace").glob("*.[ch]")}
     code -= {*sources, Path("rsltrace/_core.abi3.so")}
     missing = {str(p) for p in code if "__pycache__" not in p.parts} - set(names)
     assert not missing, f"not in the wheel: {sorted(missing)}"
