@@ -399,6 +399,34 @@ def test_a_main_waits_for_its_threads_and_takes_its_daemons_with_it(simulate: An
     ]  # fmt: skip
 
 
+def test_nodes_see_no_threads_of_who_has_started_the_run(simulate: Any) -> None:
+    over = threading.Event()
+    foreign = threading.Thread(target=over.wait, daemon=True)
+    seen: list[Any] = []
+
+    class Looks(Node):
+        def __init__(self) -> None:
+            super().__init__("looks")
+            self.create_timer(1.0, self.look)
+
+        def look(self) -> None:
+            own = threading.Thread(target=time.sleep, args=(1,), name="own")
+            own.start()
+            seen.append([thread.name for thread in threading.enumerate()])
+            seen.append(threading.active_count())
+            own.join()
+            raise SystemExit
+
+    foreign.start()
+    try:
+        simulate(Looks)
+        assert foreign in threading.enumerate()
+    finally:
+        over.set()
+        foreign.join()
+    assert seen == [["MainThread", "own"], 2]
+
+
 @pytest.mark.long
 def test_nothing_is_left_after_a_run(simulate: Any) -> None:
     before = (

@@ -47,6 +47,7 @@ _FIRST_IDENT = 1_000_001
 _FIRST_OF_IMPORTS = 10_001
 _real_get_ident = _thread.get_ident
 _real_start_new_thread = _thread.start_new_thread
+_real_enumerate = threading.enumerate
 _Thread = threading.Thread
 _pool_worker = futures_thread._worker
 _real = {name: getattr(_Thread, name) for name in ("start", "join", "is_alive")}
@@ -349,6 +350,15 @@ def _start_new_thread(
     return thread.ident
 
 
+def _enumerate() -> list[threading.Thread]:
+    """Return the threads of nodes: those of who has started the run come and go."""
+    threads = _real_enumerate()
+    if calling_runtime() is None:
+        return threads
+    main = threading.main_thread()
+    return [thread for thread in threads if thread is main or hasattr(thread, "_rsltrace")]
+
+
 @contextmanager
 def cooperative_threads(runtime: Runtime) -> Iterator[None]:
     """Simulate the threads that user code starts within the ``with`` block."""
@@ -364,6 +374,8 @@ def cooperative_threads(runtime: Runtime) -> Iterator[None]:
         (threading, "_allocate_lock", SimLock),
         (threading, "_CRLock", SimRLock),
         (threading, "get_ident", _get_ident),
+        (threading, "enumerate", _enumerate),
+        (threading, "active_count", lambda: len(_enumerate())),
         (threading, "local", _threading_local.local),
         (threading, "_time", now),
         (threading, "_counter", _numbers()),
