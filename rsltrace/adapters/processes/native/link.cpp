@@ -58,7 +58,17 @@ constexpr std::size_t LENGTH = sizeof(Turns);
 // The loop is gone, or says nothing that makes sense: nothing of this process may outlive the run.
 [[noreturn]] void lost() { leave(120); }
 
+// Whether the program has closed a descriptor of the link. It is asked for each batch, as whether the
+// descriptors are needed depends on who sleeps.
+bool is_closed() {
+  pollfd both[] = {{turn_fd, 0, 0}, {said_fd, 0, 0}};
+  constexpr timespec now{};
+  if (syscall(SYS_ppoll, both, 2, &now, nullptr, 0) <= 0) return false;
+  return ((both[0].revents | both[1].revents) & POLLNVAL) != 0;
+}
+
 void send_batch() {
+  if (is_closed()) lost();
   turns().batches.fetch_add(1);
   if (turns().loop_sleeps.exchange(0) == 0 && turns().may_spin != 0) return;
   constexpr std::uint64_t once = 1;
