@@ -74,6 +74,7 @@ attach(_word, schema={"type": ["string", "number"]})
 
 
 def _metric_name(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` can be the name of a metric: one line of text."""
     if not name.strip() or not name.isprintable():
         raise ValueError(f"{describe(name)} is no name: use a word, as in distance")
 

@@ -12,7 +12,7 @@ namespace {
 
 constexpr std::uint32_t SPINS = 4000;  // about 100 us: the loop may have to be woken itself
 constexpr std::uint32_t PAUSE_MAX = 1024;  // turns
-constexpr std::uint32_t LOOKS = 64;
+constexpr std::uint32_t LOOKS = 64;  // it is asked after so many turns whether others want the core
 
 void relax() {
 #if defined(__x86_64__)
@@ -35,6 +35,8 @@ bool is_contended() {
 }  // namespace
 
 bool has_turn(Turns &turns) {
+  // The turn that comes next; for how many turns not to spin: now, after the next time in vain, and
+  // after the next time that others have wanted the core.
   static std::uint32_t next = 0, rests = 0, pause = 0, spun = 0, yields = LOOKS;
   ++next;
   if (turns.may_spin == 0) return false;
