@@ -12,13 +12,19 @@
 enum {
   REST = 62,        /* format.EVENT_REST */
   REST_OUTPUTS = 56,
+  EVENT = 8 + REST, /* behind its chain hash */
   CONTENT = 16,     /* format.OUTPUT_CONTENT */
   CONTENT_KIND = 12,
   DRAW = 11,        /* OutputKind.DRAW */
   SUBSCRIPTION = 3, /* EventKind.SUBSCRIPTION */
+  HEADER = 31,      /* mcap/records.MESSAGE_HEAD */
+  RECORD_HEAD = 9,
+  MESSAGE = 5,
+  LARGE = 64 << 10, /* mcap/chunk_builder.LARGE_BYTES */
 };
 
 #define U8 0xFFu
+#define U16 0xFFFFu
 #define U32 0xFFFFFFFFu
 #define U64 UINT64_MAX
 
@@ -73,7 +79,7 @@ typedef struct {
 
 static int append(Bytes *bytes, const void *data, size_t size) {
   if (bytes->size + size > bytes->capacity) {
-    const size_t capacity = 2 * bytes->capacity + 4096;
+    const size_t capacity = 2 * bytes->capacity + LARGE;
     uint8_t *larger = PyMem_Realloc(bytes->data, capacity);
     if (larger == NULL) {
       PyErr_NoMemory();
@@ -89,10 +95,9 @@ static int append(Bytes *bytes, const void *data, size_t size) {
 
 typedef struct {
   PyObject_HEAD
-  PyObject *write_segment, *write_payloads, *payloads, *sequences;
-  Py_ssize_t events_max, outputs_max, payload_bytes_max, header_bytes;
-  Py_ssize_t payload_bytes;
-  Bytes rests, chain_hashes, contents, numbers;
+  PyObject *write_segment, *write_payloads, *sequences, *pieces;
+  Py_ssize_t events_max, outputs_max, payload_bytes_max, payload_bytes;
+  Bytes events, contents, numbers, headers, records;
 } Buffer;
 
 static PyTypeObject *buffer_type;
@@ -103,12 +108,6 @@ static PyObject *bytes_of(const uint8_t *data, Py_ssize_t size) {
   return PyBytes_FromStringAndSize((const char *)data, size);
 }
 
-static int called(PyObject *function) {
-  PyObject *result = PyObject_CallObject(function, NULL);
-  Py_XDECREF(result);
-  return result == NULL ? -1 : 0;
-}
-
 static int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_ssize_t most) {
   if (count >= least && count <= most) return 0;
   PyErr_Format(PyExc_TypeError, "%s() got %zd arguments", name, count);
@@ -116,29 +115,24 @@ static int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_
 }
 
 static PyObject *buffer_new(PyTypeObject *type, PyObject *args, PyObject *named) {
-  static char *names[] = {"write_segment",     "write_payloads", "events_max", "outputs_max",
-                          "payload_bytes_max", "header_bytes",   NULL};
-  PyObject *write_segment, *write_payloads, *first;
-  Py_ssize_t limits[4];
+  static char *names[] = {"write_segment", "write_payloads", "sequences",
+                          "events_max",    "outputs_max",    "payload_bytes_max", NULL};
+  PyObject *write_segment, *write_payloads, *sequences;
+  Py_ssize_t limits[3];
   Buffer *self;
-  if (!PyArg_ParseTupleAndKeywords(args, named, "OOnnnn", names, &write_segment, &write_payloads,
-                                   limits, limits + 1, limits + 2, limits + 3))
+  if (!PyArg_ParseTupleAndKeywords(args, named, "OOO!nnn", names, &write_segment, &write_payloads,
+                                   &PyList_Type, &sequences, limits, limits + 1, limits + 2))
     return NULL;
   self = (Buffer *)PyType_GenericAlloc(type, 0);
   if (self == NULL) return NULL;
   self->write_segment = Py_NewRef(write_segment);
   self->write_payloads = Py_NewRef(write_payloads);
+  self->sequences = Py_NewRef(sequences);
   self->events_max = limits[0];
   self->outputs_max = limits[1];
   self->payload_bytes_max = limits[2];
-  self->header_bytes = limits[3];
-  self->payloads = PyList_New(0);
-  self->sequences = PyList_New(1);
-  first = PyLong_FromLong(0);
-  if (self->payloads == NULL || self->sequences == NULL || first == NULL ||
-      PyList_SetItem(self->sequences, 0, Py_NewRef(first)) < 0)
-    Py_CLEAR(self);
-  Py_XDECREF(first);
+  self->pieces = PyList_New(0);
+  if (self->pieces == NULL) Py_CLEAR(self);
   return (PyObject *)self;
 }
 
@@ -146,7 +140,6 @@ static int buffer_traverse(Buffer *self, visitproc visit, void *arg) {
   Py_VISIT(Py_TYPE(self));
   Py_VISIT(self->write_segment);
   Py_VISIT(self->write_payloads);
-  Py_VISIT(self->payloads);
   Py_VISIT(self->sequences);
   return 0;
 }
@@ -158,65 +151,16 @@ static int buffer_clear(Buffer *self) {
   return 0;
 }
 
-static void free_rows(Buffer *self) {
-  Bytes *all[] = {&self->rests, &self->chain_hashes, &self->contents, &self->numbers};
-  for (int i = 0; i < 4; ++i) {
-    PyMem_Free(all[i]->data);
-    memset(all[i], 0, sizeof *all[i]);
-  }
-}
-
 static void buffer_dealloc(Buffer *self) {
   PyTypeObject *type = Py_TYPE(self);
+  Bytes *all[] = {&self->events, &self->contents, &self->numbers, &self->headers, &self->records};
   PyObject_GC_UnTrack(self);
   buffer_clear(self);
-  Py_CLEAR(self->payloads);
   Py_CLEAR(self->sequences);
-  free_rows(self);
+  Py_CLEAR(self->pieces);
+  for (int i = 0; i < 5; ++i) PyMem_Free(all[i]->data);
   PyObject_GC_Del(self);
   Py_DECREF(type);
-}
-
-/* Returns the sequence of the message in its channel. */
-static PyObject *add_payload(Buffer *self, PyObject *channel, PyObject *stamp, PyObject *data) {
-  PyObject *sequence, *next, *parts[4];
-  Py_ssize_t size;
-  const Py_ssize_t place = PyNumber_AsSsize_t(channel, PyExc_IndexError);
-  if (place == -1 && PyErr_Occurred()) return NULL;
-  sequence = PyList_GetItem(self->sequences, place);
-  if (sequence == NULL) return NULL;
-  Py_INCREF(sequence);
-  parts[0] = channel, parts[1] = sequence, parts[2] = stamp, parts[3] = data;
-  size = PyObject_Length(data);
-  if (size < 0) goto failed;
-  for (int i = 0; i < 4; ++i)
-    if (PyList_Append(self->payloads, parts[i]) < 0) goto failed;
-  next = PyLong_FromUnsignedLongLong(PyLong_AsUnsignedLongLong(sequence) + 1);
-  if (next == NULL || PyList_SetItem(self->sequences, place, next) < 0) goto failed;
-  self->payload_bytes += size + self->header_bytes;
-  if (self->payload_bytes >= self->payload_bytes_max && called(self->write_payloads) < 0)
-    goto failed;
-  return sequence;
-failed:
-  Py_DECREF(sequence);
-  return NULL;
-}
-
-static int add_event(Buffer *self, const uint8_t *rest, uint64_t chain_hash) {
-  if (append(&self->rests, rest, REST) < 0) return -1;
-  if (append(&self->chain_hashes, &chain_hash, 8) < 0) {
-    self->rests.size -= REST;
-    return -1;
-  }
-  if (self->rests.size >= (size_t)self->events_max * REST ||
-      self->contents.size >= (size_t)self->outputs_max * CONTENT)
-    return called(self->write_segment);
-  return 0;
-}
-
-static PyObject *buffer_add_payload(Buffer *self, PyObject *const *args, Py_ssize_t count) {
-  if (check_count("add_payload", count, 3, 3) < 0) return NULL;
-  return add_payload(self, args[0], args[1], args[2]);
 }
 
 /* Returns bytes of the wanted size, or NULL with an error. */
@@ -229,15 +173,110 @@ static const uint8_t *packed_bytes(PyObject *packed, Py_ssize_t wanted) {
   return NULL;
 }
 
+/* Stores a number at the place of a row; returns whether it fits. */
+static int put(uint8_t *row, PyObject *value, uint64_t most, size_t size) {
+  const uint64_t number = PyLong_AsUnsignedLongLong(value);
+  if (number == U64 && PyErr_Occurred()) {
+    PyErr_Clear();
+    return 0;
+  }
+  memcpy(row, &number, size);
+  return number <= most;
+}
+
+PyObject *attribute_of(const char *module_name, const char *name) {
+  PyObject *module = PyImport_ImportModule(module_name), *found;
+  if (module == NULL) return NULL;
+  found = PyObject_GetAttrString(module, name);
+  Py_DECREF(module);
+  return found;
+}
+
+/* Packs a row as Python does: what does not fit is an error, what is an index may fit. */
+static int pack_by(const char *module, const char *name, uint8_t *row, Py_ssize_t size,
+                   PyObject *values) {
+  PyObject *layout = values == NULL ? NULL : attribute_of(module, name);
+  PyObject *pack = layout == NULL ? NULL : PyObject_GetAttrString(layout, "pack");
+  PyObject *packed = pack == NULL ? NULL : PyObject_CallObject(pack, values);
+  const uint8_t *data = packed == NULL ? NULL : packed_bytes(packed, size);
+  if (data != NULL) memcpy(row, data, size);
+  Py_XDECREF(values);
+  Py_XDECREF(layout);
+  Py_XDECREF(pack);
+  Py_XDECREF(packed);
+  return data == NULL ? -1 : 0;
+}
+
+/* Makes a piece of the records so far. */
+static int end_piece(Buffer *self) {
+  PyObject *piece = bytes_of(self->records.data, self->records.size);
+  const int result = piece == NULL ? -1 : PyList_Append(self->pieces, piece);
+  Py_XDECREF(piece);
+  self->records.size = 0;
+  return result;
+}
+
+/* Returns the sequence of the message in its channel. */
+static PyObject *add_payload(Buffer *self, PyObject *channel, PyObject *stamp, PyObject *data) {
+  uint8_t header[HEADER] = {MESSAGE};
+  PyObject *sequence, *next;
+  unsigned long long number;
+  char *content;
+  Py_ssize_t size, length;
+  const Py_ssize_t place = PyNumber_AsSsize_t(channel, PyExc_IndexError);
+  if (place == -1 && PyErr_Occurred()) return NULL;
+  sequence = PyList_GetItem(self->sequences, place);
+  if (sequence == NULL || PyBytes_AsStringAndSize(data, &content, &size) < 0) return NULL;
+  number = PyLong_AsUnsignedLongLong(sequence);
+  if (number == U64 && PyErr_Occurred()) return NULL;
+  length = size + HEADER - RECORD_HEAD;
+  memcpy(header + 1, &length, 8);
+  memcpy(header + 11, &number, 4);
+  if (number <= U32 && put(header + 9, channel, U16, 2) && put(header + 15, stamp, U64, 8))
+    memcpy(header + 23, header + 15, 8);
+  else if (pack_by("rsltrace.trace.mcap.records", "MESSAGE_HEAD", header, HEADER,
+                   Py_BuildValue("inOKOO", MESSAGE, length, channel, number, stamp, stamp)) < 0)
+    return NULL;
+  next = PyLong_FromUnsignedLongLong(number + 1);
+  if (next == NULL || append(&self->headers, header, HEADER) < 0 ||
+      append(&self->records, header, HEADER) < 0 ||
+      (size < LARGE ? append(&self->records, content, size)
+                    : end_piece(self) < 0 || PyList_Append(self->pieces, data)) ||
+      PyList_SetItem(self->sequences, place, next) < 0)
+    return NULL;
+  self->payload_bytes += size + HEADER;
+  if ((self->payload_bytes >= self->payload_bytes_max || number + 1 >= U32) &&
+      done(PyObject_CallObject(self->write_payloads, NULL)) < 0)
+    return NULL;
+  return PyLong_FromUnsignedLongLong(number);
+}
+
+/* ``row`` is packed behind its chain hash. */
+static int add_event(Buffer *self, const uint8_t *row) {
+  if (append(&self->events, row, EVENT) < 0) return -1;
+  if (self->events.size >= (size_t)self->events_max * EVENT ||
+      self->contents.size >= (size_t)self->outputs_max * CONTENT)
+    return done(PyObject_CallObject(self->write_segment, NULL));
+  return 0;
+}
+
+static PyObject *buffer_add_payload(Buffer *self, PyObject *const *args, Py_ssize_t count) {
+  if (check_count("add_payload", count, 3, 3) < 0) return NULL;
+  return add_payload(self, args[0], args[1], args[2]);
+}
+
 static PyObject *buffer_add_event(Buffer *self, PyObject *const *args, Py_ssize_t count) {
+  uint8_t row[EVENT];
   const uint8_t *rest;
   uint64_t chain_hash;
   if (check_count("add_event", count, 2, 2) < 0) return NULL;
   rest = packed_bytes(args[0], REST);
   if (rest == NULL) return NULL;
   chain_hash = PyLong_AsUnsignedLongLong(args[1]);
-  if ((chain_hash == U64 && PyErr_Occurred()) || add_event(self, rest, chain_hash) < 0)
-    return NULL;
+  if (chain_hash == U64 && PyErr_Occurred()) return NULL;
+  memcpy(row, &chain_hash, 8);
+  memcpy(row + 8, rest, REST);
+  if (add_event(self, row) < 0) return NULL;
   Py_RETURN_NONE;
 }
 
@@ -263,21 +302,27 @@ static PyObject *buffer_add_sequence(Buffer *self, PyObject *sequence) {
   Py_RETURN_NONE;
 }
 
+static PyObject *buffer_take_payloads(Buffer *self, PyObject *Py_UNUSED(none)) {
+  PyObject *taken;
+  if (self->records.size && end_piece(self) < 0) return NULL;
+  taken = Py_BuildValue("NN", bytes_of(self->headers.data, self->headers.size),
+                        PyList_AsTuple(self->pieces));
+  if (taken == NULL || PyList_SetSlice(self->pieces, 0, PY_SSIZE_T_MAX, NULL) < 0) return NULL;
+  self->headers.size = self->payload_bytes = 0;
+  return taken;
+}
+
 static PyObject *buffer_rows(Buffer *self, PyObject *Py_UNUSED(none)) {
-  const Bytes *all[] = {&self->rests, &self->chain_hashes, &self->contents, &self->numbers};
-  PyObject *rows = PyTuple_New(4);
-  for (int i = 0; rows != NULL && i < 4; ++i) {
-    PyObject *bytes = PyBytes_FromStringAndSize((char *)all[i]->data, all[i]->size);
-    if (bytes == NULL || PyTuple_SetItem(rows, i, bytes) < 0) Py_CLEAR(rows);
-  }
-  return rows;
+  return Py_BuildValue("NNN", bytes_of(self->events.data, self->events.size),
+                       bytes_of(self->contents.data, self->contents.size),
+                       bytes_of(self->numbers.data, self->numbers.size));
 }
 
 static PyObject *buffer_drop_unfinished(Buffer *self, PyObject *Py_UNUSED(none)) {
   size_t outputs = 0, numbered = 0;
   uint32_t value;
-  for (size_t place = REST_OUTPUTS; place < self->rests.size; place += REST) {
-    memcpy(&value, self->rests.data + place, 4);
+  for (size_t place = 8 + REST_OUTPUTS; place < self->events.size; place += EVENT) {
+    memcpy(&value, self->events.data + place, 4);
     outputs += value;
   }
   if (outputs * CONTENT < self->contents.size) self->contents.size = outputs * CONTENT;
@@ -290,12 +335,12 @@ static PyObject *buffer_drop_unfinished(Buffer *self, PyObject *Py_UNUSED(none))
 }
 
 static PyObject *buffer_clear_rows(Buffer *self, PyObject *Py_UNUSED(none)) {
-  free_rows(self);
+  self->events.size = self->contents.size = self->numbers.size = 0;
   Py_RETURN_NONE;
 }
 
 static PyObject *buffer_events(Buffer *self, void *Py_UNUSED(none)) {
-  return PyLong_FromSize_t(self->rests.size / REST);
+  return PyLong_FromSize_t(self->events.size / EVENT);
 }
 
 static PyObject *buffer_outputs(Buffer *self, void *Py_UNUSED(none)) {
@@ -307,6 +352,7 @@ static PyMethodDef buffer_methods[] = {
     {"add_event", (PyCFunction)(void (*)(void))buffer_add_event, METH_FASTCALL, NULL},
     {"add_output", (PyCFunction)buffer_add_output, METH_O, NULL},
     {"add_sequence", (PyCFunction)buffer_add_sequence, METH_O, NULL},
+    {"take_payloads", (PyCFunction)buffer_take_payloads, METH_NOARGS, NULL},
     {"rows", (PyCFunction)buffer_rows, METH_NOARGS, NULL},
     {"drop_unfinished", (PyCFunction)buffer_drop_unfinished, METH_NOARGS, NULL},
     {"clear_rows", (PyCFunction)buffer_clear_rows, METH_NOARGS, NULL},
@@ -314,9 +360,7 @@ static PyMethodDef buffer_methods[] = {
 };
 
 static PyMemberDef buffer_members[] = {
-    {"payloads", T_OBJECT_EX, offsetof(Buffer, payloads), READONLY, NULL},
-    {"sequences", T_OBJECT_EX, offsetof(Buffer, sequences), READONLY, NULL},
-    {"payload_bytes", T_PYSSIZET, offsetof(Buffer, payload_bytes), 0, NULL},
+    {"payload_bytes", T_PYSSIZET, offsetof(Buffer, payload_bytes), READONLY, NULL},
     {NULL, 0, 0, 0, NULL},
 };
 
@@ -408,53 +452,18 @@ static int chain_init(Chain *self, PyObject *args, PyObject *named) {
   return 0;
 }
 
-/* Stores a number at the place of a row; returns whether it fits. */
-static int put(uint8_t *row, PyObject *value, uint64_t most, size_t size) {
-  const uint64_t number = PyLong_AsUnsignedLongLong(value);
-  if (number == U64 && PyErr_Occurred()) {
-    PyErr_Clear();
-    return 0;
-  }
-  memcpy(row, &number, size);
-  return number <= most;
-}
-
-PyObject *attribute_of(const char *module_name, const char *name) {
-  PyObject *module = PyImport_ImportModule(module_name), *found;
-  if (module == NULL) return NULL;
-  found = PyObject_GetAttrString(module, name);
-  Py_DECREF(module);
-  return found;
-}
-
-static PyObject *layout(const char *name) {
-  return attribute_of("rsltrace.trace.format", name);
-}
-
-static int copy_packed(uint8_t *row, PyObject *packed, Py_ssize_t size) {
-  const uint8_t *data = packed == NULL ? NULL : packed_bytes(packed, size);
-  if (data != NULL) memcpy(row, data, size);
-  Py_XDECREF(packed);
-  return data == NULL ? -1 : 0;
-}
-
 static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, PyObject *kind) {
   uint8_t row[CONTENT];
   if (!(put(row, content_hash, U64, 8) && put(row + 8, entity, U32, 4) &&
-        put(row + CONTENT_KIND, kind, U32, 4))) {
-    PyObject *by = layout("OUTPUT_CONTENT"), *packed;
-    if (by == NULL) return -1;
-    packed = PyObject_CallMethod(by, "pack", "OOO", content_hash, entity, kind);
-    Py_DECREF(by);
-    if (copy_packed(row, packed, CONTENT) < 0) return -1;
-  }
+        put(row + CONTENT_KIND, kind, U32, 4)) &&
+      pack_by("rsltrace.trace.format", "OUTPUT_CONTENT", row, CONTENT,
+              Py_BuildValue("OOO", content_hash, entity, kind)) < 0)
+    return -1;
   self->output_hash = content_hash64(row, self->output_hash);
   if (self->buffer != NULL) {
     if (append(&self->buffer->contents, row, CONTENT) < 0) return -1;
-  } else {
-    PyObject *result = PyObject_CallFunction(self->add_output, "N", bytes_of(row, CONTENT));
-    if (result == NULL) return -1;
-    Py_DECREF(result);
+  } else if (done(PyObject_CallFunction(self->add_output, "N", bytes_of(row, CONTENT))) < 0) {
+    return -1;
   }
   const Py_ssize_t count = PyTuple_Size(self->observers);
   if (count) {
@@ -464,13 +473,11 @@ static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, Py
     memcpy(&shown_hash, row, 8);
     memcpy(shown, row + 8, 8);
     for (Py_ssize_t i = 0; i < count; ++i) {
-      PyObject *result = PyObject_CallFunction(PyTuple_GetItem(observers, i), "IIK", shown[1],
-                                               shown[0], (unsigned long long)shown_hash);
-      if (result == NULL) {
+      if (done(PyObject_CallFunction(PyTuple_GetItem(observers, i), "IIK", shown[1], shown[0],
+                                     (unsigned long long)shown_hash)) < 0) {
         Py_DECREF(observers);
         return -1;
       }
-      Py_DECREF(result);
     }
     Py_DECREF(observers);
   }
@@ -483,10 +490,8 @@ static PyObject *add_output(Chain *self, PyObject *kind, PyObject *entity, PyObj
   if (add_content(self, content_hash, entity, kind) < 0) return NULL;
   if (self->buffer != NULL) {
     if (add_sequence(self->buffer, sequence) < 0) return NULL;
-  } else {
-    PyObject *result = PyObject_CallFunctionObjArgs(self->add_sequence, sequence, NULL);
-    if (result == NULL) return NULL;
-    Py_DECREF(result);
+  } else if (done(PyObject_CallFunctionObjArgs(self->add_sequence, sequence, NULL)) < 0) {
+    return NULL;
   }
   return PyLong_FromUnsignedLongLong(self->outputs++);
 }
@@ -523,7 +528,6 @@ static PyObject *chain_message(Chain *self, PyObject *const *args, Py_ssize_t co
 }
 
 static int pack_rest(Chain *self, PyObject *const *args, Py_ssize_t count, uint8_t *row) {
-  PyObject *by, *state, *packed;
   const uint64_t none = 0;
   const uint32_t outputs = (uint32_t)self->outputs;
   const uint64_t index = self->index, output_hash = self->output_hash;
@@ -536,30 +540,24 @@ static int pack_rest(Chain *self, PyObject *const *args, Py_ssize_t count, uint8
       put(row + 16, args[4], U64, 8) && put(row + 52, args[5], U32, 4) &&
       put(row + 24, args[6], U64, 8) && (count < 8 || put(row + 40, args[7], U64, 8)))
     return 0;
-  by = layout("EVENT_REST");
-  if (by == NULL) return -1;
-  state = count < 8 ? PyLong_FromLong(0) : Py_NewRef(args[7]);
-  packed = state == NULL ? NULL
-                         : PyObject_CallMethod(by, "pack", "KOOOKOOOKOO", self->index, args[0],
-                                               args[4], args[6], self->output_hash, state, args[3],
-                                               args[5], self->outputs, args[1], args[2]);
-  Py_XDECREF(state);
-  Py_DECREF(by);
-  return copy_packed(row, packed, REST);
+  return pack_by("rsltrace.trace.format", "EVENT_REST", row, REST,
+                 Py_BuildValue("KOOOKNOOKOO", self->index, args[0], args[4], args[6],
+                               self->output_hash,
+                               count < 8 ? PyLong_FromLong(0) : Py_NewRef(args[7]), args[3],
+                               args[5], self->outputs, args[1], args[2]));
 }
 
 static PyObject *chain_end_event(Chain *self, PyObject *const *args, Py_ssize_t count) {
-  uint8_t row[REST];
-  if (check_count("end_event", count, 7, 8) < 0 || pack_rest(self, args, count, row) < 0)
+  uint8_t row[EVENT], *rest = row + 8;
+  if (check_count("end_event", count, 7, 8) < 0 || pack_rest(self, args, count, rest) < 0)
     return NULL;
-  self->chain_hash = rest_hash64(row, self->chain_hash);
+  self->chain_hash = rest_hash64(rest, self->chain_hash);
+  memcpy(row, &self->chain_hash, 8);
   if (self->buffer != NULL) {
-    if (add_event(self->buffer, row, self->chain_hash) < 0) return NULL;
-  } else {
-    PyObject *result = PyObject_CallFunction(self->add_event, "NK", bytes_of(row, REST),
-                                             self->chain_hash);
-    if (result == NULL) return NULL;
-    Py_DECREF(result);
+    if (add_event(self->buffer, row) < 0) return NULL;
+  } else if (done(PyObject_CallFunction(self->add_event, "NK", bytes_of(rest, REST),
+                                        self->chain_hash)) < 0) {
+    return NULL;
   }
   self->index++;
   self->outputs = self->output_hash = 0;
@@ -828,7 +826,7 @@ static int run_event(Dispatcher *self, PyObject *const *call) {
   if (!failed && event->on_end != Py_None) {
     PyObject *on_end = event->on_end;
     event->on_end = Py_NewRef(Py_None);
-    failed = called(on_end) < 0;
+    failed = done(PyObject_CallObject(on_end, NULL)) < 0;
     Py_DECREF(on_end);
   }
   Py_DECREF(event);

@@ -18,7 +18,6 @@ from rsltrace.trace.chain import hash64, verify_chain
 from rsltrace.trace.dtypes import (
     EVENT_DTYPE,
     EVENT_MESSAGE_DTYPE,
-    EVENT_REST_DTYPE,
     OUTPUT_CONTENT_DTYPE,
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
@@ -26,8 +25,14 @@ from rsltrace.trace.dtypes import (
 )
 from rsltrace.trace.format import CDR_HEADER, OUTPUT_HASHED
 from rsltrace.trace.index import SegmentTable, damage_error, read_chunk
-from rsltrace.trace.mcap.chunk_builder import ChunkBody, rows_chunk
-from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD, DamageError, RecordSpan
+from rsltrace.trace.mcap.chunk_builder import MESSAGE_HEADER_DTYPE, ChunkBody, rows_chunk
+from rsltrace.trace.mcap.records import (
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    DamageError,
+    RecordSpan,
+)
 from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.model.event import (
     NO_SEQUENCE,
@@ -38,90 +43,61 @@ from rsltrace.trace.model.event import (
     OutputKind,
 )
 
-_SEQUENCE_MASK = 2**32 - 1
-_CHAINED_DTYPE = np.dtype([("chain_hash", "<u8"), ("rest", f"V{EVENT_REST_DTYPE.itemsize}")])
-_NUMBERED_DTYPE = np.dtype(
-    [("event", "<u8"), ("content", f"V{OUTPUT_CONTENT_DTYPE.itemsize}"), ("sequence", "<u4")]
+_FRONT = ("front", f"V{MESSAGE_HEADER_DTYPE.itemsize + len(CDR_HEADER)}")
+_EVENT_PARTS = np.dtype([_FRONT, ("event", f"V{EVENT_DTYPE.itemsize}")])
+_OUTPUT_PARTS = np.dtype(
+    [
+        _FRONT,
+        ("event", "<u8"),
+        ("content", f"V{OUTPUT_CONTENT_DTYPE.itemsize}"),
+        ("sequence", "<u4"),
+    ]
 )
-assert _CHAINED_DTYPE.itemsize == EVENT_DTYPE.itemsize
-assert _NUMBERED_DTYPE.itemsize == OUTPUT_DTYPE.itemsize
 
 
-def event_rows(rests: bytes, chain_hashes: bytes) -> npt.NDArray[np.void]:
-    """Return the events as an array of EVENT_DTYPE, shape (n,). ``rests`` are packed EVENT_REST."""
-    packed = np.frombuffer(rests, dtype=_CHAINED_DTYPE["rest"])
-    rows = np.empty(len(packed), dtype=_CHAINED_DTYPE)
-    rows["chain_hash"] = np.frombuffer(chain_hashes, dtype="<u8")
-    rows["rest"] = packed
-    return rows.view(EVENT_DTYPE)
-
-
-def output_rows(
-    contents: bytes, sequences: bytes, events: npt.NDArray[np.void]
-) -> npt.NDArray[np.void]:
-    """Return the outputs of ``events`` as an array of OUTPUT_DTYPE, shape (n,).
-
-    ``contents`` are packed OUTPUT_CONTENT, ``sequences`` those of all outputs except draws.
-    """
-    packed = np.frombuffer(contents, dtype=OUTPUT_CONTENT_DTYPE)
-    numbered = packed["kind"] != OutputKind.DRAW
-    numbers = np.frombuffer(sequences, dtype="<u4")
-    owners = np.repeat(events["index"], events["outputs"])
-    assert len(owners) == len(packed), "outputs do not match their events"
-    assert np.count_nonzero(numbered) == len(numbers), "outputs do not match their sequences"
-    rows = np.empty(len(packed), dtype=_NUMBERED_DTYPE)
-    rows["event"] = owners
-    rows["content"] = packed.view(_NUMBERED_DTYPE["content"])
-    sequence = np.full(len(packed), NO_SEQUENCE, dtype="<u4")
-    sequence[numbered] = numbers
-    rows["sequence"] = sequence
-    return rows.view(OUTPUT_DTYPE)
-
-
-def events_chunk(rows: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
-    """Return the chunk of a segment's events; a message's time is its event's stamp."""
-    messages = _messages(rows, EVENT_MESSAGE_DTYPE, channel_id)
-    messages["message_sequence"] = rows["index"] & np.uint64(_SEQUENCE_MASK)
-    messages["log_time"] = messages["publish_time"] = rows["stamp"]
+def events_chunk(events: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
+    """Return the chunk of a segment's events: EVENT_DTYPE, contiguous. A message's time is its
+    event's stamp."""
+    messages = _messages(len(events), EVENT_MESSAGE_DTYPE, channel_id)
+    messages.view(_EVENT_PARTS)["event"] = events.view(_EVENT_PARTS["event"])
+    messages["message_sequence"] = events["index"].astype("<u4")
+    messages["log_time"] = messages["publish_time"] = events["stamp"]
     return rows_chunk(messages, channel_id)
 
 
 def outputs_chunk(
-    rows: npt.NDArray[np.void],
+    contents: bytes,
+    sequences: bytes,
     events: npt.NDArray[np.void],
     first_output: int,
     channel_id: int,
 ) -> ChunkBody:
     """Return the chunk of a segment's outputs; a message's time is the stamp of its event.
 
-    ``rows`` are OUTPUT_DTYPE, ``events`` the segment's EVENT_DTYPE rows; ``first_output`` is the
-    number of outputs before them.
+    ``contents`` are packed OUTPUT_CONTENT, ``sequences`` those of all outputs except draws,
+    ``events`` the segment's; ``first_output`` is the number of outputs before them.
     """
-    messages = _messages(rows, OUTPUT_MESSAGE_DTYPE, channel_id)
-    numbers = np.arange(first_output, first_output + len(rows), dtype=np.uint64)
-    messages["message_sequence"] = numbers & np.uint64(_SEQUENCE_MASK)
-    stamps = np.repeat(events["stamp"], events["outputs"])
-    messages["log_time"] = messages["publish_time"] = stamps
+    packed = np.frombuffer(contents, dtype=OUTPUT_CONTENT_DTYPE)
+    numbered = packed["kind"] != OutputKind.DRAW
+    numbers = np.frombuffer(sequences, dtype="<u4")
+    assert np.count_nonzero(numbered) == len(numbers), "outputs do not match their sequences"
+    messages = _messages(len(packed), OUTPUT_MESSAGE_DTYPE, channel_id)
+    parts = messages.view(_OUTPUT_PARTS)
+    parts["content"] = packed.view(_OUTPUT_PARTS["content"])
+    parts["event"] = np.repeat(events["index"], events["outputs"])
+    parts["sequence"] = NO_SEQUENCE
+    parts["sequence"][numbered] = numbers
+    places = np.arange(first_output, first_output + len(packed), dtype="<u8")
+    messages["message_sequence"] = places.astype("<u4")
+    messages["log_time"] = messages["publish_time"] = np.repeat(events["stamp"], events["outputs"])
     return rows_chunk(messages, channel_id)
 
 
-def _messages(
-    rows: npt.NDArray[np.void], layout: np.dtype[np.void], channel_id: int
-) -> npt.NDArray[np.void]:
-    """Return messages of ``layout`` with ``rows``; the caller sets sequence and times."""
-    head = np.zeros(1, dtype=layout)
-    head["opcode"] = MESSAGE
-    head["length"] = layout.itemsize - RECORD_HEAD.size
-    head["channel_id"] = channel_id
-    head["cdr"] = CDR_HEADER
-    whole = np.dtype(f"V{layout.itemsize}")
-    row = np.dtype(f"V{rows.dtype.itemsize}")
-    messages = np.empty(len(rows), dtype=layout)
-    messages.view(whole)[:] = head.view(whole)
-    messages.view([("head", f"V{whole.itemsize - row.itemsize}"), ("row", row)])["row"] = rows.view(
-        row
-    )
-    return messages
+def _messages(count: int, layout: np.dtype[np.void], channel_id: int) -> npt.NDArray[np.void]:
+    """Return messages of ``layout``; the caller sets sequence, times and content."""
+    head = MESSAGE_HEAD.pack(MESSAGE, layout.itemsize - RECORD_HEAD.size, channel_id, 0, 0, 0)
+    # np.empty would be as slow: it clears an array of structures.
+    return np.frombuffer(bytearray(head + CDR_HEADER).ljust(layout.itemsize, b"\0") * count, layout)
 
 
 _CDR_LITTLE_ENDIAN = b"\x00\x01"

@@ -21,7 +21,7 @@ from rsltrace.errors import OutputError
 from rsltrace.trace import segments
 from rsltrace.trace.cdr import pack_code_line, pack_detail, pack_entity, pack_finding
 from rsltrace.trace.chain import digest_text
-from rsltrace.trace.dtypes import EVENT_REST_DTYPE, OUTPUT_CONTENT_DTYPE, SEGMENT_DTYPE
+from rsltrace.trace.dtypes import EVENT_DTYPE, OUTPUT_CONTENT_DTYPE, SEGMENT_DTYPE
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
     CDR_HEADER,
@@ -57,8 +57,8 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.index import metadata_checksum
 from rsltrace.trace.mcap.buffered_writer import BufferedWriter
-from rsltrace.trace.mcap.chunk_builder import PendingMessages, messages_chunk
-from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX, MESSAGE_HEAD
+from rsltrace.trace.mcap.chunk_builder import joined, messages_chunk
+from rsltrace.trace.mcap.records import MESSAGE, MESSAGE_BYTES_MAX, MESSAGE_HEAD, RECORD_HEAD
 from rsltrace.trace.mcap.writer import McapWriter
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, OutputKind
@@ -66,6 +66,8 @@ from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.rosbag2 import KEY, BagTopicMetadata, bag_metadata_yaml, normalized_qos
 
 _HEADER_BYTES = MESSAGE_HEAD.size
+_HEADER_REST = _HEADER_BYTES - RECORD_HEAD.size
+_pack_header = MESSAGE_HEAD.pack
 SEGMENT_MEDIA_TYPE = "application/octet-stream"
 
 
@@ -73,28 +75,28 @@ class PythonRecordBuffer:
     """What waits to be written. The compiled module has an equal class.
 
     ``write_segment`` is called when there are ``events_max`` events or ``outputs_max`` outputs,
-    ``write_payloads`` when the payloads have ``payload_bytes_max`` bytes, with ``header_bytes`` for
-    each. ``sequences`` are the next ones by channel id, which counts from 1.
+    ``write_payloads`` when the payloads have ``payload_bytes_max`` bytes, or a channel has no
+    sequence left. ``sequences`` are the next ones by channel id, which counts from 1.
     """
 
     def __init__(
         self,
         write_segment: Callable[[], None],
         write_payloads: Callable[[], None],
+        sequences: list[int],
         *,
         events_max: int,
         outputs_max: int,
         payload_bytes_max: int,
-        header_bytes: int,
     ) -> None:
         self._write_segment, self._write_payloads = write_segment, write_payloads
+        self._sequences = sequences
         self._events_max, self._outputs_max = events_max, outputs_max
-        self._payload_bytes_max, self._header_bytes = payload_bytes_max, header_bytes
-        self.payloads: PendingMessages = []
+        self._payload_bytes_max = payload_bytes_max
+        # Header and data of each: one flat list has nothing that the garbage collector must visit.
+        self._payloads: list[bytes] = []
         self.payload_bytes = 0
-        self.sequences: list[int] = [0]
-        self._rests: list[bytes] = []
-        self._chain_hashes = array("Q")
+        self._events: list[bytes] = []
         self._outputs: list[bytes] = []
         self._output_sequences = array("I")
         self.add_output: Callable[[bytes], None] = self._outputs.append
@@ -102,43 +104,50 @@ class PythonRecordBuffer:
 
     @property
     def events(self) -> int:
-        return len(self._rests)
+        return len(self._events)
 
     @property
     def outputs(self) -> int:
         return len(self._outputs)
 
     def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
-        sequence = self.sequences[channel_id]
-        self.payloads.extend((channel_id, sequence, stamp_ns, data))
-        self.sequences[channel_id] = sequence + 1
-        self.payload_bytes += len(data) + self._header_bytes
-        if self.payload_bytes >= self._payload_bytes_max:
+        sequence, size = self._sequences[channel_id], len(data)
+        header = _pack_header(
+            MESSAGE, size + _HEADER_REST, channel_id, sequence, stamp_ns, stamp_ns
+        )
+        self._payloads.extend((header, data))
+        self._sequences[channel_id] = following = sequence + 1
+        self.payload_bytes += size + _HEADER_BYTES
+        if self.payload_bytes >= self._payload_bytes_max or following >= NO_SEQUENCE:
             self._write_payloads()
         return sequence
 
+    def take_payloads(self) -> tuple[bytes, tuple[bytes, ...]]:
+        """Return the headers of the payloads and, in parts, the whole messages; forget them."""
+        taken = b"".join(self._payloads[0::2]), joined(self._payloads)
+        self._payloads.clear()
+        self.payload_bytes = 0
+        return taken
+
     def add_event(self, rest: bytes, chain_hash: int) -> None:
-        self._rests.append(rest)
-        self._chain_hashes.append(chain_hash)
-        if len(self._rests) >= self._events_max or len(self._outputs) >= self._outputs_max:
+        self._events.append(chain_hash.to_bytes(8, "little") + rest)
+        if len(self._events) >= self._events_max or len(self._outputs) >= self._outputs_max:
             self._write_segment()
 
-    def rows(self) -> tuple[bytes, bytes, bytes, bytes]:
-        """Return the events without their chain hashes, these, the outputs and their sequences."""
-        rests, outputs = b"".join(self._rests), b"".join(self._outputs)
-        return rests, self._chain_hashes.tobytes(), outputs, self._output_sequences.tobytes()
+    def rows(self) -> tuple[bytes, bytes, bytes]:
+        """Return the events, the outputs, and these' sequences."""
+        events, outputs = b"".join(self._events), b"".join(self._outputs)
+        return events, outputs, self._output_sequences.tobytes()
 
     def clear_rows(self) -> None:
-        self._rests.clear()
+        self._events.clear()
         self._outputs.clear()
         del self._output_sequences[:]
-        del self._chain_hashes[:]
 
     def drop_unfinished(self) -> None:
         """Drop what follows the last whole event: an interrupt may come anywhere."""
-        del self._rests[len(self._chain_hashes) :]
-        rests = np.frombuffer(b"".join(self._rests), dtype=EVENT_REST_DTYPE)
-        del self._outputs[int(rests["outputs"].sum()) :]
+        events = np.frombuffer(b"".join(self._events), dtype=EVENT_DTYPE)
+        del self._outputs[int(events["outputs"].sum()) :]
         contents = np.frombuffer(b"".join(self._outputs), dtype=OUTPUT_CONTENT_DTYPE)
         numbered = int(np.count_nonzero(contents["kind"] != OutputKind.DRAW))
         del self._output_sequences[numbered:]
@@ -179,21 +188,24 @@ class TraceWriter:
         Raises OutputError if ``path`` exists and ``force`` is false, is a folder, or cannot be
         created. Missing folders are not made: mostly they are typing errors.
         """
-        self._buffer = buffer = RecordBuffer(
-            self._write_segment,
-            self._write_payloads,
-            events_max=events_per_segment or EVENTS_PER_SEGMENT,
-            outputs_max=OUTPUTS_PER_SEGMENT,
-            payload_bytes_max=PAYLOAD_BYTES_PER_CHUNK,
-            header_bytes=_HEADER_BYTES,
+        self._sequences = [0]
+        # Entities have a chunk of their own: a reader needs them first, and nothing else.
+        self._buffer, self._entities = (
+            RecordBuffer(
+                self._write_segment,
+                write,
+                self._sequences,
+                events_max=events_per_segment or EVENTS_PER_SEGMENT,
+                outputs_max=OUTPUTS_PER_SEGMENT,
+                payload_bytes_max=PAYLOAD_BYTES_PER_CHUNK,
+            )
+            for write in (self._write_payloads, self._write_entities)
         )
+        buffer = self._buffer
         self.add_event: Callable[[bytes, int], None] = buffer.add_event
         self.add_output: Callable[[bytes], None] = buffer.add_output
         self.add_sequence: Callable[[int], None] = buffer.add_sequence
         self.add_payload: Callable[[int, int, bytes], int] = buffer.add_payload
-        self._sequences = buffer.sequences
-        self._entities: PendingMessages = []
-        self._entity_bytes = 0
         self._channel_ids: dict[tuple[str, str], int] = {}
         self._segments: list[bytes] = []
         self._events_written = 0
@@ -266,11 +278,9 @@ class TraceWriter:
     @property
     def digest(self) -> str:
         """The digest so far: the last chain hash as 16 hex digits."""
-        chain_hashes = self._buffer.rows()[1]
-        last = (
-            int.from_bytes(chain_hashes[-8:], "little") if chain_hashes else self._last_chain_hash
-        )
-        return digest_text(last)
+        events = np.frombuffer(self._buffer.rows()[0], dtype=EVENT_DTYPE)
+        last = events["chain_hash"][-1] if len(events) else self._last_chain_hash
+        return digest_text(int(last))
 
     @property
     def size(self) -> int:
@@ -318,14 +328,9 @@ class TraceWriter:
 
     def add_entity(self, entity: Entity) -> int:
         """Add an entity before the first event that names it."""
-        channel_id, data = self._entity_channel, pack_entity(entity)
-        sequence = self._sequences[channel_id]
-        self._entities.extend((channel_id, sequence, entity.created_ns, data))
-        self._sequences[channel_id] = sequence + 1
-        self._entity_bytes += len(data) + _HEADER_BYTES
-        if self._entity_bytes >= PAYLOAD_BYTES_PER_CHUNK:
-            self._write_entities()
-        return sequence
+        return self._entities.add_payload(
+            self._entity_channel, entity.created_ns, pack_entity(entity)
+        )
 
     def add_detail(self, event: int, output: int, stamp_ns: int, text: str) -> int:
         """Add the text of output number ``output`` of ``event``. Returns its sequence."""
@@ -385,31 +390,26 @@ class TraceWriter:
         return self.add_channel(topic, type_name, SCHEMA_TEXT[type_name])
 
     def _write_entities(self) -> None:
-        """Write them in their own chunk: a reader needs them first, and nothing else."""
-        if self._entities:
-            self._write_waiting(self._entities)
-            self._entity_bytes = 0
+        self._write_messages(self._entities)
 
     def _write_payloads(self) -> None:
-        if not self._buffer.payloads:
+        self._write_messages(self._buffer)
+
+    def _write_messages(self, waiting: PythonRecordBuffer) -> None:
+        if not waiting.payload_bytes:
             return
         if max(self._sequences) >= NO_SEQUENCE:
             raise OutputError(
                 f"a topic has more than {NO_SEQUENCE} messages, more than a trace can number; "
                 "leave its payloads out (record: exclude: in the job)"
             )
-        if self._buffer.payload_bytes > MESSAGE_BYTES_MAX + PAYLOAD_BYTES_PER_CHUNK:
+        if waiting.payload_bytes > MESSAGE_BYTES_MAX + PAYLOAD_BYTES_PER_CHUNK:
             raise OutputError(
                 f"a message has more than {MESSAGE_BYTES_MAX} bytes, more than a trace can hold; "
                 "leave its topic out (record: exclude: in the job)"
             )
-        self._write_waiting(self._buffer.payloads)
-        self._buffer.payload_bytes = 0
-
-    def _write_waiting(self, waiting: PendingMessages) -> None:
         try:
-            self._stream.chunk(messages_chunk(waiting))
-            waiting.clear()
+            self._stream.chunk(messages_chunk(*waiting.take_payloads()))
         except BaseException:
             self._stream.poison()
             raise
@@ -424,22 +424,26 @@ class TraceWriter:
             raise
 
     def _write_events_and_outputs(self) -> None:
-        rests, chain_hashes, contents, sequences = self._buffer.rows()
-        events = segments.event_rows(rests, chain_hashes)
+        rows, contents, sequences = self._buffer.rows()
+        events = np.frombuffer(rows, dtype=EVENT_DTYPE)
         self._check(events)
-        outputs = segments.output_rows(contents, sequences, events)
-        outputs_at = (0, 0)
-        if len(outputs):
+        count, outputs_at = int(events["outputs"].sum()), (0, 0)
+        assert len(contents) == count * OUTPUT_CONTENT_DTYPE.itemsize, (
+            "outputs do not match their events"
+        )
+        if contents or sequences:
             outputs_at = self._stream.chunk(
-                segments.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
+                segments.outputs_chunk(
+                    contents, sequences, events, self._outputs_written, self._output_channel
+                )
             )
         events_at = self._stream.chunk(segments.events_chunk(events, self._event_channel))
         firsts = (self._events_written, self._outputs_written)
-        row = segments.segment_row(events, len(outputs), firsts, events_at, outputs_at)
+        row = segments.segment_row(events, count, firsts, events_at, outputs_at)
         self._segments.append(row.tobytes())
         self._last_chain_hash = int(events["chain_hash"][-1])
         self._events_written += len(events)
-        self._outputs_written += len(outputs)
+        self._outputs_written += count
         self._buffer.clear_rows()
 
     def _check(self, events: npt.NDArray[np.void]) -> None:

@@ -508,7 +508,7 @@ def test_a_run_leaves_no_memory_behind() -> None:
         "        run.subscriptions[2].queue.clear()\n"
         "        run.loop.ready.clear()\n"
         "        buffer = run.dispatcher.recorder.writer._buffer\n"
-        "        buffer.clear_rows(), buffer.payloads.clear()\n"
+        "        buffer.clear_rows(), buffer.take_payloads()\n"
         "        run.dispatcher.outcome.drops.clear()\n"
         "    gone = [weakref.ref(one) for one in (run.loop, run.publisher, run.dispatcher)]\n"
         "    del run, buffer\n"

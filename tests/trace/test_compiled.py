@@ -16,6 +16,7 @@ import pytest
 
 from rsltrace import compiled
 from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
+from rsltrace.trace.mcap.chunk_builder import LARGE_BYTES
 from rsltrace.trace.recorder import PythonEventChain
 from rsltrace.trace.writer import PythonRecordBuffer
 
@@ -30,15 +31,15 @@ class Writer:
     def __init__(self, buffer: Any, chain: Any, *, direct: bool) -> None:
         self.log: list[Any] = []
         self.fails = False
+        self.sequences = [0, 0, 2**32 - 5]
         self.buffer = buffer(
             self.write_segment,
             self.write_payloads,
+            self.sequences,
             events_max=20,
             outputs_max=30,
             payload_bytes_max=400,
-            header_bytes=31,
         )
-        self.buffer.sequences.extend([0, 2**32 - 3])
         for name in ("add_event", "add_output", "add_sequence", "add_payload"):
             method = getattr(self.buffer, name)
             # As of a writer of its own, such as a debugger's.
@@ -59,16 +60,14 @@ class Writer:
         self.buffer.clear_rows()
 
     def write_payloads(self) -> None:
-        self.log.append(list(self.buffer.payloads))
-        self.buffer.payloads.clear()
-        self.buffer.payload_bytes = 0
+        self.log.append((self.buffer.payload_bytes, self.buffer.take_payloads()))
 
     def state(self) -> Any:
         chain, buffer = self.chain, self.buffer
         return (
             (chain.index, chain.chain_hash, chain.outputs, chain.output_hash),
             (buffer.events, buffer.outputs, buffer.rows()),
-            (buffer.payloads, buffer.sequences, buffer.payload_bytes),
+            (self.sequences, buffer.payload_bytes),
             self.log,
         )
 
@@ -125,12 +124,31 @@ def test_records_and_errors_are_the_same(seed: int, direct: bool) -> None:
             ours.chain.index = python.chain.index = number
             for writer in both:
                 writer.buffer.clear_rows()
-                writer.buffer.payloads.clear()
+                writer.buffer.take_payloads()
         assert ours.state() == python.state(), (name, args)
         assert told[0] == told[1]
     for writer in both:
         writer.buffer.drop_unfinished()
+        writer.write_payloads()
     assert ours.state() == python.state()
+
+
+@needs_core
+@pytest.mark.parametrize("sizes", [(1, -1), (1, 0, 0), (0, 1, 0, 1)])
+def test_large_messages_are_pieces_of_their_own(sizes: tuple[int, ...]) -> None:
+    datas = [bytes(size if size > 0 else LARGE_BYTES + size) for size in sizes]
+    taken = []
+    for class_ in (core.RecordBuffer, PythonRecordBuffer):
+        buffer = class_(len, len, [0, 0], events_max=1, outputs_max=1, payload_bytes_max=1 << 30)
+        for number, data in enumerate(datas):
+            buffer.add_payload(1, number, data)
+        headers, parts = buffer.take_payloads()
+        large = [data for data in datas if len(data) >= LARGE_BYTES]
+        assert [part for part in parts if any(part is data for data in large)] == large
+        assert buffer.payload_bytes == 0
+        assert buffer.take_payloads() == (b"", ())
+        taken.append((headers, parts))
+    assert taken[0] == taken[1]
 
 
 @needs_core
@@ -239,7 +257,7 @@ spec.loader.exec_module(module)
 from rsltrace import compiled
 assert compiled.core is module
 for _ in range(50_000):
-    module.RecordBuffer(*[None] * 2, *[1] * 4).clear_rows()
+    module.RecordBuffer(None, None, [], *[1] * 3).clear_rows()
 sys.exit(pytest.main(["-q", "-p", "no:cacheprovider", "-k", "same", *sys.argv[2:]]))
 """
 

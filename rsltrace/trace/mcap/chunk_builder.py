@@ -1,14 +1,13 @@
 """Build chunks of MCAP messages in bulk.
 
 Writing one message at a time takes several microseconds in Python, and a run has 100,000 messages
-per second. So messages are collected, and numpy lays out a whole chunk of them with its message
-indexes: messages of one size as one structured array, others joined with headers from one array.
+per second. So messages are collected, and numpy makes a whole chunk of them with its message
+indexes: messages of one size as one structured array, others from records that are ready.
 """
 
 from __future__ import annotations
 
 import struct
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,14 +31,7 @@ one layout with it."""
 
 
 _INDEX_HEAD = struct.Struct("<BQHI")
-_INDEX_ENTRY_DTYPE = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
-_HEADER_BYTES = MESSAGE_HEADER_DTYPE.itemsize
 
-PendingMessages = list[Any]
-"""Messages for the next chunk: channel id, sequence, stamp in ns and data of each. One flat list
-contains nothing that the garbage collector must visit."""
-
-PENDING_FIELDS = 4
 LARGE_BYTES = 64 << 10
 """Messages from this size on are not copied."""
 
@@ -70,33 +62,30 @@ class ChunkBody:
         return self.parts[0] if len(self.parts) == 1 else b"".join(self.parts)
 
 
-def messages_chunk(waiting: PendingMessages) -> ChunkBody:
-    """Return the chunk of messages of any size and channel, in order (at least one)."""
-    datas: list[bytes] = waiting[3::PENDING_FIELDS]
-    count = len(datas)
-    channels = np.array(waiting[0::PENDING_FIELDS], dtype="<u2")
-    times = np.array(waiting[2::PENDING_FIELDS], dtype="<u8")
-    sizes = np.fromiter(map(len, datas), dtype="<u8", count=count) + np.uint64(_HEADER_BYTES)
-    headers = np.empty(count, dtype=MESSAGE_HEADER_DTYPE)
-    headers["opcode"] = Opcode.MESSAGE
-    headers["length"] = sizes - np.uint64(RECORD_HEAD.size)
-    headers["channel_id"] = channels
-    headers["message_sequence"] = waiting[1::PENDING_FIELDS]
-    headers["log_time"] = headers["publish_time"] = times
-    pieces = [b""] * (2 * count)
-    pieces[0::2] = headers.view(f"V{_HEADER_BYTES}").tolist()
-    pieces[1::2] = datas
-    offsets = np.cumsum(sizes) - sizes
+def messages_chunk(headers: bytes, parts: tuple[bytes, ...]) -> ChunkBody:
+    """Return the chunk of messages of any size and channel (at least one).
+
+    ``headers`` are all of them in order, ``parts`` the records, as in ChunkBody.
+    """
+    messages = np.frombuffer(headers, dtype=MESSAGE_HEADER_DTYPE)
+    ends = np.cumsum(messages["length"] + np.uint64(RECORD_HEAD.size))
+    assert int(ends[-1]) == sum(map(len, parts)), "messages do not match their headers"
+    entries = np.zeros((len(messages), 2), dtype="<u8")
+    entries[:, 0] = times = messages["log_time"]
+    entries[1:, 1] = ends[:-1]
+    channels = messages["channel_id"]
     indexes = []
-    for channel_id in sorted(set(waiting[0::PENDING_FIELDS])):  # np.unique would load numpy.ma
-        chosen = channels == channel_id
-        indexes.append(_message_index(channel_id, times[chosen], offsets[chosen]))
-    parts = _joined(pieces) if int(sizes.max()) >= LARGE_BYTES else (b"".join(pieces),)
+    for channel_id in np.bincount(channels).nonzero()[0].tolist():  # np.unique loads numpy.ma
+        chosen = entries[channels == channel_id]
+        record = _index_record(channel_id, chosen.tobytes())
+        indexes.append((channel_id, len(chosen), record))
     return ChunkBody(parts, int(times.min()), int(times.max()), tuple(indexes))
 
 
-def _joined(pieces: list[bytes]) -> tuple[bytes, ...]:
-    """Join the small pieces between large ones."""
+def joined(pieces: list[bytes]) -> tuple[bytes, ...]:
+    """Join header and data of messages, the small pieces between large ones."""
+    if pieces and max(map(len, pieces[1::2])) < LARGE_BYTES:
+        return (b"".join(pieces),)
     parts: list[bytes] = []
     small: list[bytes] = []
     for piece in pieces:
@@ -117,15 +106,6 @@ def rows_chunk(messages: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
     times = messages["log_time"]
     index = (channel_id, len(messages), _index_record(channel_id, b""))
     return ChunkBody((messages.tobytes(),), int(times.min()), int(times.max()), (index,), rows=True)
-
-
-def _message_index(
-    channel_id: int, times: npt.NDArray[np.uint64], offsets: npt.NDArray[np.uint64]
-) -> tuple[int, int, bytes]:
-    entries = np.empty(len(times), dtype=_INDEX_ENTRY_DTYPE)
-    entries["log_time"] = times
-    entries["offset"] = offsets
-    return channel_id, len(times), _index_record(channel_id, entries.tobytes())
 
 
 def _index_record(channel_id: int, entries: bytes) -> bytes:
