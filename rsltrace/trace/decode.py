@@ -136,7 +136,7 @@ class Decoder:
 
 
 class _DecodingStore(Typestore):  # type: ignore[misc]  # it has no types
-    """Makes what decodes a type: one of the fifteen functions that rosbags would compile."""
+    """Makes what decodes a type: one of the twelve functions that rosbags would compile."""
 
     def get_msgdef(self, typename: str) -> _MessageType:
         """Return what decodes a type, made when it is first asked for."""
