@@ -14,7 +14,7 @@ time collecting while it imported modules."""
 
 _ONLY_READS = frozenset("cat diff export fit history info latency view why".split())
 """Commands that run no nodes. They have no use for the threads that numpy's BLAS starts for each
-core as it is loaded, and that spin a while before they sleep: a seventh of a short command's time."""
+core as it is loaded, and that spin before they sleep: a seventh of a short command's time."""
 
 
 def main() -> NoReturn:
