@@ -13,13 +13,14 @@ import math
 import re
 import struct
 from copy import copy
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
-from rosbags.typesys.base import TypesysError
+from rosbags.serde.cdr import generate_deserialize_cdr
+from rosbags.typesys.base import TypesysError, normalize_fieldname
 from rosbags.typesys.msg import get_types_from_msg, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
@@ -79,7 +80,7 @@ class Decoder:
             for name in types:
                 _nesting(name, types, depths)
             # A store per schema: two channels may define one type differently.
-            self._store = Typestore()
+            self._store = _DecodingStore()
             self._store.register(self.types)
             self._store.get_msgdef(self.name)
             for name in types:  # once the classes are made, which would have them as fields
@@ -132,6 +133,33 @@ class Decoder:
             f"messages on {self._channel.topic} cannot be decoded: the trace's schema of "
             f"{self._channel.type or 'their type'} is not usable ({first_line})"
         )
+
+
+class _DecodingStore(Typestore):  # type: ignore[misc]  # it has no types
+    """Makes what decodes a type: one of the twelve functions that rosbags would compile."""
+
+    def get_msgdef(self, typename: str) -> _MessageType:
+        """Return what decodes a type, made when it is first asked for."""
+        found: _MessageType | None = self.cache.get(typename)
+        if found is None:
+            found = self.cache[typename] = _MessageType(self, typename)
+        return found
+
+
+class _MessageType:
+    """As much of rosbags' ``Msgdef`` as decoding needs."""
+
+    def __init__(self, store: _DecodingStore, name: str) -> None:
+        self.cls = store.types[name]
+        described = store.fielddefs[name][1]
+        self.fields = [(normalize_fieldname(field), detail) for field, detail in described]
+        self._store = store
+        self.deserialize_cdr_le = generate_deserialize_cdr(self.fields, store, "le")
+
+    @cached_property
+    def deserialize_cdr_be(self) -> Any:
+        """Decodes data of a machine with the other order of bytes, which is rare."""
+        return generate_deserialize_cdr(self.fields, self._store, "be")
 
 
 class Decoders:

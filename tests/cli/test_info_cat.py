@@ -30,6 +30,7 @@ from trace_maker import (
 )
 
 from rsltrace.cli.main import cli
+from rsltrace.guard.pin import THREAD_VARIABLES
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
@@ -494,6 +495,25 @@ def test_a_command_loads_nothing_that_it_does_not_need(
     loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "rsltrace.cli.main" in loaded
     assert [name for name in (*_REPORTS, *not_needed) if name in loaded] == []
+
+
+_THREADS = """
+import atexit, os, sys
+atexit.register(lambda: print(len(os.listdir("/proc/self/task")), "numpy" in sys.modules))
+from rsltrace.cli.start import main
+sys.argv = ["rsltrace", "cat", "a.mcap"]
+main()
+"""
+
+
+def test_reading_starts_no_threads(tmp_path: Path) -> None:
+    write_run(tmp_path / "a.mcap", 10)
+    environment = {n: value for n, value in os.environ.items() if n not in THREAD_VARIABLES}
+    done = subprocess.run(
+        [sys.executable, "-c", _THREADS], cwd=tmp_path, env=environment, capture_output=True
+    )
+    # numpy's BLAS starts one for each core but one, if it may.
+    assert done.stdout.splitlines()[-1] == b"1 True"
 
 
 def test_version() -> None:

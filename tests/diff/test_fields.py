@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rosbags.typesys.store import Typestore
 
 from rsltrace.diff.bags.comparison import ContentKeys
 from rsltrace.diff.facts.evidence import FieldDifference, MessageDifference, Presence
@@ -63,12 +64,13 @@ def decoder(schema: str = SCHEMA, name: str = "pkg/msg/All") -> Decoder:
 
 
 ALL = decoder()
+STORE = Typestore()
+STORE.register(ALL.types)
 
 
 def message(**changes: Any) -> Any:
     """A message as decoding gives it, with some fields set by their paths."""
-    store = ALL._store
-    types = store.types
+    types = STORE.types
     point = types["geometry_msgs/msg/Point"]
     fields: dict[str, Any] = {
         "header": types["std_msgs/msg/Header"](
@@ -90,7 +92,7 @@ def message(**changes: Any) -> Any:
     }
     fields.update(changes)
     name = "pkg/msg/All"
-    raw = store.serialize_cdr(types[name](**fields), name)
+    raw = STORE.serialize_cdr(types[name](**fields), name)
     return ALL.decode(bytes(raw))
 
 
@@ -431,7 +433,7 @@ def test_no_difference_is_found_exactly_when_the_bytes_are_equal(
     s, t = s.replace("\0", ""), t.replace("\0", "")
     a = message(ranges=np.array(ranges_a, dtype=np.float32), double=x, text=s)
     b = message(ranges=np.array(ranges_b, dtype=np.float32), double=y, text=t)
-    raw = [bytes(ALL._store.serialize_cdr(m, "pkg/msg/All")) for m in (a, b)]
+    raw = [bytes(STORE.serialize_cdr(m, "pkg/msg/All")) for m in (a, b)]
     found, _ = diff_messages(a, b, ONLY)
     assert (raw[0] == raw[1]) == (not found)
     swapped, _ = diff_messages(b, a, ONLY)

@@ -311,10 +311,15 @@ def align(
     have partners in an earlier block and are left alone."""
     groups = _groups(a, b, taken_a, taken_b)
     pairs = EventPairs([], [])
+    before: tuple[bool, list[int], list[int]] | None = None
     # The partner of an event's cause is a strong sign, and known only when causes are matched: so
     # what is certain without it comes first, and then everything is matched again with it.
     for surest_only in (True, False, False):
         causes_a, causes_b = _causes(a, b, pairs, past)
+        known = surest_only, causes_a, causes_b
+        if known == before:
+            break  # the same pairs would come out again
+        before = known
         pairs = EventPairs([-1] * len(a), [-1] * len(b))
         for places_a, places_b in groups:
             sequence_a, sequence_b = (
@@ -328,13 +333,8 @@ def align(
 
 
 def _sequence(rows: EventColumns, causes: list[int], places: list[int]) -> EventSequence:
-    stamp, input_, nth = rows.stamp, rows.input, rows.cause_output
-    return EventSequence(
-        stamp=[stamp[place] for place in places],
-        input=[input_[place] for place in places],
-        cause=[causes[place] for place in places],
-        nth=[nth[place] for place in places],
-    )
+    columns = (rows.stamp, rows.input, causes, rows.cause_output)
+    return EventSequence(*([*map(column.__getitem__, places)] for column in columns))
 
 
 def _groups(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
@@ -159,7 +160,7 @@ class McapFooter(NamedTuple):
     crc: int
 
 
-@dataclass(slots=True)
+@dataclass
 class McapSummary:
     """What a file's records say: schemas and channels by id, metadata and attachments by name.
 
@@ -194,9 +195,17 @@ class McapSummary:
 
     def chunks(self, channels: frozenset[int] | None = None) -> Iterator[ChunkIndexEntry]:
         """Yield the chunks, or those with messages of some channels. Raises DamageError."""
-        for body in self._chunk_indexes:
-            if channels is None or not channels.isdisjoint(channels_of_chunk_index(body)):
-                yield parse_chunk_index(body)
+        if channels is None:
+            yield from map(parse_chunk_index, self._chunk_indexes)
+        elif channels:
+            for body, held in zip(self._chunk_indexes, self._held, strict=True):
+                if not channels.isdisjoint(held):
+                    yield parse_chunk_index(body)
+
+    @cached_property
+    def _held(self) -> list[list[int]]:
+        """The channels of each chunk. A large trace has thousands, and few are looked for often."""
+        return list(map(channels_of_chunk_index, self._chunk_indexes))
 
 
 def has_end(source: ByteSource) -> bool:
