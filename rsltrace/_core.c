@@ -105,9 +105,7 @@ static PyObject *bytes_of(const uint8_t *data, Py_ssize_t size) {
 }
 
 static int called(PyObject *function) {
-  PyObject *result = PyObject_CallObject(function, NULL);
-  Py_XDECREF(result);
-  return result == NULL ? -1 : 0;
+  return done(PyObject_CallObject(function, NULL));
 }
 
 static int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_ssize_t most) {
@@ -425,28 +423,20 @@ static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, Py
   self->output_hash = content_hash64(row, self->output_hash);
   if (self->buffer != NULL) {
     if (append(&self->buffer->contents, row, CONTENT) < 0) return -1;
-  } else {
-    PyObject *result = PyObject_CallFunction(self->add_output, "N", bytes_of(row, CONTENT));
-    if (result == NULL) return -1;
-    Py_DECREF(result);
+  } else if (done(PyObject_CallFunction(self->add_output, "N", bytes_of(row, CONTENT))) < 0) {
+    return -1;
   }
   const Py_ssize_t count = PyTuple_Size(self->observers);
   if (count) {
     PyObject *observers = Py_NewRef(self->observers);
-    uint64_t shown_hash;
     uint32_t shown[2];
-    memcpy(&shown_hash, row, 8);
+    int failed = 0;
     memcpy(shown, row + 8, 8);
-    for (Py_ssize_t i = 0; i < count; ++i) {
-      PyObject *result = PyObject_CallFunction(PyTuple_GetItem(observers, i), "IIK", shown[1],
-                                               shown[0], (unsigned long long)shown_hash);
-      if (result == NULL) {
-        Py_DECREF(observers);
-        return -1;
-      }
-      Py_DECREF(result);
-    }
+    for (Py_ssize_t i = 0; i < count && !failed; ++i)
+      failed = done(PyObject_CallFunction(PyTuple_GetItem(observers, i), "IIK", shown[1], shown[0],
+                                          (unsigned long long)at(row)));
     Py_DECREF(observers);
+    return failed;
   }
   return 0;
 }
@@ -457,10 +447,8 @@ static PyObject *add_output(Chain *self, PyObject *kind, PyObject *entity, PyObj
   if (add_content(self, content_hash, entity, kind) < 0) return NULL;
   if (self->buffer != NULL) {
     if (add_sequence(self->buffer, sequence) < 0) return NULL;
-  } else {
-    PyObject *result = PyObject_CallFunctionObjArgs(self->add_sequence, sequence, NULL);
-    if (result == NULL) return NULL;
-    Py_DECREF(result);
+  } else if (done(PyObject_CallFunctionObjArgs(self->add_sequence, sequence, NULL)) < 0) {
+    return NULL;
   }
   return PyLong_FromUnsignedLongLong(self->outputs++);
 }
@@ -529,11 +517,9 @@ static PyObject *chain_end_event(Chain *self, PyObject *const *args, Py_ssize_t 
   self->chain_hash = rest_hash64(row, self->chain_hash);
   if (self->buffer != NULL) {
     if (add_event(self->buffer, row, self->chain_hash) < 0) return NULL;
-  } else {
-    PyObject *result = PyObject_CallFunction(self->add_event, "NK", bytes_of(row, REST),
-                                             self->chain_hash);
-    if (result == NULL) return NULL;
-    Py_DECREF(result);
+  } else if (done(PyObject_CallFunction(self->add_event, "NK", bytes_of(row, REST),
+                                        self->chain_hash)) < 0) {
+    return NULL;
   }
   self->index++;
   self->outputs = self->output_hash = 0;
