@@ -16,6 +16,7 @@ enum {
   CONTENT = 16,     /* format.OUTPUT_CONTENT */
   CONTENT_KIND = 12,
   DRAW = 11,        /* OutputKind.DRAW */
+  TIMER = 2,        /* EventKind.TIMER */
   SUBSCRIPTION = 3, /* EventKind.SUBSCRIPTION */
   HEADER = 31,      /* mcap/records.MESSAGE_HEAD */
   RECORD_HEAD = 9,
@@ -393,34 +394,7 @@ typedef struct {
   unsigned long long index, chain_hash, outputs, output_hash;
 } Chain;
 
-static int chain_traverse(Chain *self, visitproc visit, void *arg) {
-  Py_VISIT(Py_TYPE(self));
-  Py_VISIT(self->add_event);
-  Py_VISIT(self->add_output);
-  Py_VISIT(self->add_sequence);
-  Py_VISIT(self->add_payload);
-  Py_VISIT(self->buffer);
-  Py_VISIT(self->observers);
-  return 0;
-}
-
-static int chain_clear(Chain *self) {
-  Py_CLEAR(self->add_event);
-  Py_CLEAR(self->add_output);
-  Py_CLEAR(self->add_sequence);
-  Py_CLEAR(self->add_payload);
-  Py_CLEAR(self->buffer);
-  Py_CLEAR(self->observers);
-  return 0;
-}
-
-static void chain_dealloc(Chain *self) {
-  PyTypeObject *type = Py_TYPE(self);
-  PyObject_GC_UnTrack(self);
-  chain_clear(self);
-  PyObject_GC_Del(self);
-  Py_DECREF(type);
-}
+OBJECTS(chain, (offsetof(Chain, index) - sizeof(PyObject)) / sizeof(PyObject *))
 
 /* Returns whose method a built-in one is, if it is a compiled buffer's; borrowed. */
 static Buffer *buffer_of(PyObject *method) {
@@ -435,7 +409,7 @@ static int chain_init(Chain *self, PyObject *args, PyObject *named) {
   PyObject *writer;
   Buffer *buffer;
   if (!PyArg_ParseTupleAndKeywords(args, named, "O", names, &writer)) return -1;
-  chain_clear(self);
+  chain_clear((PyObject *)self);
   self->index = self->chain_hash = self->outputs = self->output_hash = 0;
   self->observers = PyTuple_New(0);
   self->add_event = PyObject_GetAttrString(writer, "add_event");
@@ -468,18 +442,14 @@ static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, Py
   const Py_ssize_t count = PyTuple_Size(self->observers);
   if (count) {
     PyObject *observers = Py_NewRef(self->observers);
-    uint64_t shown_hash;
     uint32_t shown[2];
-    memcpy(&shown_hash, row, 8);
+    int failed = 0;
     memcpy(shown, row + 8, 8);
-    for (Py_ssize_t i = 0; i < count; ++i) {
-      if (done(PyObject_CallFunction(PyTuple_GetItem(observers, i), "IIK", shown[1], shown[0],
-                                     (unsigned long long)shown_hash)) < 0) {
-        Py_DECREF(observers);
-        return -1;
-      }
-    }
+    for (Py_ssize_t i = 0; i < count && !failed; ++i)
+      failed = done(PyObject_CallFunction(PyTuple_GetItem(observers, i), "IIK", shown[1], shown[0],
+                                          (unsigned long long)at(row)));
     Py_DECREF(observers);
+    return failed;
   }
   return 0;
 }
@@ -608,13 +578,28 @@ PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen; /* subcl
 static PyTypeObject *sites_type, *chain_type;
 static PyObject *sites_seen, *publisher_seen, *node_seen, *chain_seen;
 static PyObject *deque_type, *deque_append, *deque_popleft, *hash64, *zero, *output_kind;
-static PyObject *call_back;
-static PyObject *callback_group, *active_entity, *user_callback, *raw, *admitted;
+static PyObject *call_back, *heapreplace, *no_event, *no_args;
+static PyObject *callback_group, *active_entity, *user_callback, *timer_callback, *raw, *admitted;
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *period_ns, *order, *deadline_ns, *ticket, *last_call_ns;
+} TimerState;
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *heap, *head, *next_ns;
+} TimerQueue;
+
+static PyTypeObject *timer_type, *timers_type;
+static PyObject *timer_seen, *timers_seen;
 
 FIELDS(Event, event)
 FIELDS(Dispatcher, dispatcher)
 FIELDS(Entity, entity)
 FIELDS(Sites, sites)
+FIELDS(TimerState, timer)
+FIELDS(TimerQueue, timers)
 
 PyMemberDef event_fields[] = {
     FIELD(Event, handle, "handle"),
@@ -633,6 +618,17 @@ PyMemberDef event_fields[] = {
 
 static PyMemberDef sites_fields[] = {
     FIELD(Sites, due, "due"), FIELD(Sites, running, "running"), NO_FIELD,
+};
+
+static PyMemberDef timer_fields[] = {
+    FIELD(TimerState, period_ns, "period_ns"),     FIELD(TimerState, order, "order"),
+    FIELD(TimerState, deadline_ns, "deadline_ns"), FIELD(TimerState, ticket, "ticket"),
+    FIELD(TimerState, last_call_ns, "last_call_ns"), NO_FIELD,
+};
+
+static PyMemberDef timers_fields[] = {
+    FIELD(TimerQueue, heap, "_heap"), FIELD(TimerQueue, head, "head"),
+    FIELD(TimerQueue, next_ns, "next_ns"), NO_FIELD,
 };
 
 PyMemberDef dispatcher_fields[] = {
@@ -955,18 +951,13 @@ static int record_message(Entity *self, PyObject *recorder, PyObject *now_ns, Py
 }
 
 static PyObject *delivery_of(Loop *loop, PyObject *now_ns, PyObject *data, PyObject *digest,
-                             PyObject *position, PyObject *count) {
-  PyObject *items[] = {now_ns,   zero,   zero,   Py_None, data, loop->events,
-                       position, digest, now_ns, count};
-  PyObject *delivery;
-  for (int i = 0; i < 10; ++i) Py_INCREF(items[i]);
-  delivery = PyTuple_New(10); /* a collection of garbage may publish, and replace fields */
-  for (int i = 0; i < 10; ++i) {
-    if (delivery == NULL)
-      Py_DECREF(items[i]);
-    else
-      PyTuple_SetItem(delivery, i, items[i]);
-  }
+                             PyObject *position, PyObject *number) {
+  /* A new tuple: a collection of garbage may publish, and replace fields. */
+  PyObject *event = Py_NewRef(loop->events), *count = Py_NewRef(number);
+  PyObject *delivery = PyTuple_Pack(10, now_ns, zero, zero, Py_None, data, event, position, digest,
+                                    now_ns, count);
+  Py_DECREF(count);
+  Py_DECREF(event);
   return delivery;
 }
 
@@ -1081,76 +1072,95 @@ static int is_free(PyObject *wrapper) {
   return free;
 }
 
-/* Whether the next arrival is a message for a plain function that may run now; -1 with an error. */
-static int is_usual(Entity *self) {
+/* Whether an entity has a plain function, without further arguments, that may run now; -1 with an
+   error. */
+static int is_usual(Entity *self, PyObject *name_of_callback) {
   PyObject *wrapper = self->wrapper, *callback = self->callback;
-  int usual = 0;
-  if (self->queue == NULL || (PyObject *)Py_TYPE(self->queue) != deque_type ||
-      PyObject_Length(self->queue) == 0 || self->destroyed != Py_False ||
-      self->own_group != Py_False || self->coroutine != Py_False ||
+  int usual;
+  if (self->destroyed != Py_False || self->own_group != Py_False || self->coroutine != Py_False ||
       self->with_info != Py_False || wrapper == NULL || callback == NULL)
     return 0;
   Py_INCREF(wrapper);
   Py_INCREF(callback);
   usual = is_free(wrapper);
-  if (usual > 0) usual = has(wrapper, user_callback, callback);
-  if (usual > 0) usual = has(wrapper, raw, Py_False);
+  if (usual > 0) usual = has(wrapper, name_of_callback, callback);
+  if (usual > 0 && self->queue != NULL) usual = has(wrapper, raw, Py_False);
   Py_DECREF(callback);
   Py_DECREF(wrapper);
-  if (usual >= 0 || !PyErr_ExceptionMatches(PyExc_AttributeError)) return usual;
-  PyErr_Clear();
-  return 0;
+  if (usual < 0 && PyErr_ExceptionMatches(PyExc_AttributeError)) {
+    PyErr_Clear();
+    usual = 0;
+  }
+  return usual > 0 ? self->callback != NULL && self->node != NULL && self->entity_id != NULL &&
+                         self->dispatcher != NULL
+                   : usual;
+}
+
+/* Returns the mailbox of an entity's node, borrowed, or NULL if it is not known. */
+static PyObject *mailbox_of(Entity *self) {
+  PyObject *node = self->node;
+  return node != NULL && is_a(node, entity_type, &node_seen) ? ((Entity *)node)->mailbox : NULL;
 }
 
 /* Whether nobody but the loop runs the node, or the executor that does has taken this entity out of
    its mailbox (Mailbox.keeps); -1 with an error. */
 static int is_admitted(Entity *self) {
-  Entity *node = (Entity *)self->node;
-  PyObject *mailbox;
+  PyObject *mailbox = mailbox_of(self);
   int is_it;
-  if (node == NULL || !is_a((PyObject *)node, entity_type, &node_seen) || node->mailbox == NULL)
-    return 0;
-  if (node->mailbox == Py_None) return 1;
-  mailbox = Py_NewRef(node->mailbox);
+  if (mailbox == NULL || mailbox == Py_None) return mailbox != NULL;
+  Py_INCREF(mailbox);
   is_it = has(mailbox, admitted, (PyObject *)self);
   if (is_it > 0 && PyObject_SetAttr(mailbox, admitted, Py_None) < 0) is_it = -1;
   Py_DECREF(mailbox);
   return is_it;
 }
 
-/* Runs the callback for a delivery of the middleware (subscription.Delivery). */
-static int run_subscription(Entity *self, PyObject *delivery) {
-  PyObject *message, *args = NULL, *kind = PyLong_FromLong(SUBSCRIPTION);
-  PyObject *deserialize = Py_NewRef(self->deserialize), *callback = Py_NewRef(self->callback);
-  PyObject *entity = Py_NewRef(self->entity_id), *node = Py_NewRef(self->node);
-  Dispatcher *dispatcher = (Dispatcher *)Py_NewRef(self->dispatcher);
+/* Runs a callback; ``cause`` has the event, its output and the hash of the input. */
+static int run_callback(Entity *self, long number, PyObject *callback, PyObject *args,
+                        PyObject *const *cause) {
+  PyObject *kind = PyLong_FromLong(number);
+  PyObject *entity = Py_XNewRef(self->entity_id), *node = Py_XNewRef(self->node);
+  Dispatcher *dispatcher = (Dispatcher *)Py_XNewRef(self->dispatcher);
   int failed = 1;
-  message = PyObject_CallFunctionObjArgs(deserialize, PyTuple_GetItem(delivery, 4), NULL);
-  if (message != NULL) args = PyTuple_Pack(1, message);
-  Py_XDECREF(message);
-  if (kind != NULL && args != NULL && HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) {
-    PyObject *call[CALL] = {(PyObject *)self, entity, node, kind, callback, args};
-    for (int i = 0; i < 3; ++i) call[CAUSE_EVENT + i] = PyTuple_GetItem(delivery, 5 + i);
+  if (entity == NULL || node == NULL) {
+    PyErr_SetString(PyExc_AttributeError, "an entity has lost its id or node");
+  } else if (kind != NULL && HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) {
+    PyObject *call[CALL] = {(PyObject *)self, entity,   node,     kind,    callback,
+                            args,             cause[0], cause[1], cause[2]};
     failed = execute(dispatcher, call, 0);
   }
-  Py_DECREF(dispatcher);
-  Py_DECREF(node);
-  Py_DECREF(entity);
-  Py_DECREF(callback);
-  Py_DECREF(deserialize);
+  Py_XDECREF(dispatcher);
+  Py_XDECREF(node);
+  Py_XDECREF(entity);
   Py_XDECREF(kind);
+  return failed;
+}
+
+/* Runs the callback for a delivery of the middleware (subscription.Delivery). */
+static int run_subscription(Entity *self, PyObject *delivery) {
+  PyObject *callback = Py_NewRef(self->callback), *deserialize = Py_NewRef(self->deserialize);
+  PyObject *message, *args, *cause[3];
+  int failed = 1;
+  message = PyObject_CallFunctionObjArgs(deserialize, PyTuple_GetItem(delivery, 4), NULL);
+  args = message == NULL ? NULL : PyTuple_Pack(1, message);
+  Py_XDECREF(message);
+  for (int i = 0; i < 3; ++i) cause[i] = PyTuple_GetItem(delivery, 5 + i);
+  if (args != NULL) failed = run_callback(self, SUBSCRIPTION, callback, args, cause);
   Py_XDECREF(args);
+  Py_DECREF(deserialize);
+  Py_DECREF(callback);
   return failed;
 }
 
 static PyObject *subscription_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
   PyObject *delivery;
-  int failed = 1;
-  int usual = is_usual(self);
+  int failed = 1, usual = 0;
+  if (self->queue != NULL && (PyObject *)Py_TYPE(self->queue) == deque_type &&
+      PyObject_Length(self->queue) > 0)
+    usual = is_usual(self, user_callback);
   if (usual > 0) usual = is_admitted(self);
   if (usual < 0) return NULL;
-  if (!usual || self->queue == NULL || self->callback == NULL || self->deserialize == NULL ||
-      self->node == NULL || self->entity_id == NULL || self->dispatcher == NULL)
+  if (!usual || self->queue == NULL || self->callback == NULL || self->deserialize == NULL)
     return PyObject_CallMethod((PyObject *)self, "dispatch_any", NULL);
   delivery = PyObject_CallFunctionObjArgs(deque_popleft, self->queue, NULL);
   if (delivery == NULL) return NULL;
@@ -1167,7 +1177,108 @@ static PyMethodDef subscription_methods[] = {
     {NULL, NULL, 0, NULL},
 };
 
-/* The fields of an entity, and the method of a publisher or subscription. */
+/* -- Timer -------------------------------------------------------------------------------------- */
+
+/* Whether a number is a time that others can be added to. */
+static int is_ns(PyObject *value, int64_t *ns) {
+  int overflow = 1;
+  *ns = PyLong_Check(value) ? PyLong_AsLongLongAndOverflow(value, &overflow) : 0;
+  return !overflow && *ns >= 0 && *ns < INT64_MAX / 4;
+}
+
+/* Whether a timer is the first of those that wait in order (CreationOrderQueue). */
+static int is_first(TimerQueue *queue, TimerState *state) {
+  return queue != NULL && is_a((PyObject *)queue, timers_type, &timers_seen) &&
+         queue->heap != NULL && PyList_Check(queue->heap) && PyList_Size(queue->heap) > 0 &&
+         PyList_GetItem(queue->heap, 0) == state->ticket;
+}
+
+/* Returns the time after a call (TimerState.call). */
+static PyObject *next_deadline(int64_t now, int64_t deadline, int64_t period) {
+  deadline += period;
+  if (deadline <= now)
+    deadline = period == 0 ? now : deadline + (1 + (now - deadline) / period) * period;
+  return PyLong_FromLongLong(deadline);
+}
+
+static PyObject *hash_of_deadline(PyObject *recorder, int64_t deadline) {
+  PyObject *packed, *hash;
+  if (recorder == Py_None) return Py_NewRef(zero);
+  packed = bytes_of((uint8_t *)&deadline, 8);
+  hash = packed == NULL ? NULL : PyObject_CallFunctionObjArgs(hash64, packed, NULL);
+  Py_XDECREF(packed);
+  return hash;
+}
+
+/* Notes which timer is first now. */
+static int find_first(TimerQueue *queue, PyObject *heap) {
+  PyObject *first = PyList_Size(heap) > 0 ? PyList_GetItem(heap, 0) : Py_None, *timer;
+  int failed;
+  timer = PyTuple_Check(first) && PyTuple_Size(first) == 3 ? PyTuple_GetItem(first, 2) : Py_None;
+  if (!is_a(timer, timer_type, &timer_seen) || ((TimerState *)timer)->ticket != first)
+    return call_method((PyObject *)queue, "_find_head");
+  Py_INCREF(first);
+  failed = set(&queue->next_ns, Py_NewRef(PyTuple_GetItem(first, 0))) < 0 ||
+           set(&queue->head, Py_NewRef(timer)) < 0;
+  Py_DECREF(first);
+  return failed ? -1 : 0;
+}
+
+static PyObject *timer_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
+  PyObject *entry = PyTuple_New(3); /* first, as it may collect garbage: see delivery_of */
+  Dispatcher *dispatcher;
+  Loop *loop;
+  TimerQueue *queue;
+  TimerState *state;
+  int64_t now = 0, deadline = 0, period = 0;
+  int failed, usual = entry == NULL ? -1 : is_usual(self, timer_callback);
+  if (usual > 0) {
+    /* Nothing from here on to the replacement in the heap runs code of Python. */
+    dispatcher = (Dispatcher *)self->dispatcher;
+    state = (TimerState *)self->state;
+    usual = HAS_FIELDS(dispatcher, Dispatcher, dispatcher) &&
+                    HAS_FIELDS(loop = (Loop *)dispatcher->loop, Loop, loop) &&
+                    HAS_FIELDS(state, TimerState, timer)
+                ? mailbox_of(self) == Py_None
+                : -1;
+  }
+  if (usual > 0) {
+    queue = (TimerQueue *)((WholeLoop *)loop)->timers;
+    usual = is_first(queue, state) && is_ns(loop->now_ns, &now) &&
+            is_ns(state->deadline_ns, &deadline) && is_ns(state->period_ns, &period);
+  }
+  if (usual <= 0) {
+    Py_XDECREF(entry);
+    return usual < 0 ? NULL : PyObject_CallMethod((PyObject *)self, "dispatch_any", NULL);
+  }
+  PyObject *hash = hash_of_deadline(dispatcher->recorder, deadline);
+  PyObject *next = next_deadline(now, deadline, period), *cause[3] = {no_event, zero, hash};
+  PyObject *heap = Py_NewRef(queue->heap), *callback = Py_NewRef(self->callback);
+  Py_INCREF(queue);
+  PyTuple_SetItem(entry, 0, Py_XNewRef(next));
+  PyTuple_SetItem(entry, 1, Py_NewRef(state->order));
+  PyTuple_SetItem(entry, 2, Py_NewRef((PyObject *)state));
+  failed = hash == NULL || next == NULL ||
+           set(&state->last_call_ns, Py_NewRef(loop->now_ns)) < 0 ||
+           set(&state->deadline_ns, Py_NewRef(next)) < 0 ||
+           set(&state->ticket, Py_NewRef(entry)) < 0 ||
+           done(PyObject_CallFunctionObjArgs(heapreplace, heap, entry, NULL)) < 0 ||
+           find_first(queue, heap) < 0 || run_callback(self, TIMER, callback, no_args, cause);
+  Py_DECREF(queue);
+  Py_DECREF(callback);
+  Py_DECREF(heap);
+  Py_XDECREF(next);
+  Py_XDECREF(hash);
+  Py_DECREF(entry);
+  return failed ? NULL : Py_NewRef(Py_None);
+}
+
+static PyMethodDef timer_methods[] = {
+    {"dispatch", (PyCFunction)timer_dispatch, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+/* The fields of an entity, and the method of a publisher, subscription or timer. */
 static PyObject *entity_with(PyMethodDef *methods, const char *name) {
   PyType_Slot slots[] = {{Py_tp_methods, methods}, {0, NULL}};
   PyType_Spec spec = {
@@ -1181,12 +1292,16 @@ static int add_types(PyObject *module) {
   deque_append = deque_type == NULL ? NULL : PyObject_GetAttrString(deque_type, "append");
   deque_popleft = deque_type == NULL ? NULL : PyObject_GetAttrString(deque_type, "popleft");
   hash64 = attribute_of("xxhash", "xxh3_64_intdigest");
+  heapreplace = attribute_of("heapq", "heapreplace");
+  no_event = PyLong_FromUnsignedLongLong(U64);
+  no_args = PyTuple_New(0);
   zero = PyLong_FromLong(0);
   output_kind = PyUnicode_InternFromString("output_kind");
   call_back = PyUnicode_InternFromString("call_back");
   callback_group = PyUnicode_InternFromString("callback_group");
   active_entity = PyUnicode_InternFromString("_active_entity");
   user_callback = PyUnicode_InternFromString("_callback");
+  timer_callback = PyUnicode_InternFromString("callback");
   raw = PyUnicode_InternFromString("raw");
   admitted = PyUnicode_InternFromString("admitted");
   draw_kind = PyLong_FromLong(DRAW);
@@ -1197,6 +1312,8 @@ static int add_types(PyObject *module) {
   dispatcher_type = dispatcher_made(dispatcher_fields, dispatcher_methods);
   entity_type = entity_made(entity_fields, no_methods);
   sites_type = sites_made(sites_fields, no_methods);
+  timer_type = timer_made(timer_fields, no_methods);
+  timers_type = timers_made(timers_fields, no_methods);
   const struct {
     const char *name;
     PyObject *object;
@@ -1204,18 +1321,16 @@ static int add_types(PyObject *module) {
       {"RecordBuffer", (PyObject *)buffer_type},   {"EventChain", (PyObject *)chain_type},
       {"EventFields", (PyObject *)event_type},     {"EventEnd", (PyObject *)dispatcher_type},
       {"EntityFields", (PyObject *)entity_type},   {"SitesFields", (PyObject *)sites_type},
+      {"TimerStateFields", (PyObject *)timer_type},
+      {"TimerQueueFields", (PyObject *)timers_type},
       {"PublisherFields", entity_with(publisher_methods, "rsltrace._core.PublisherFields")},
       {"SubscriptionFields",
        entity_with(subscription_methods, "rsltrace._core.SubscriptionFields")},
+      {"TimerFields", entity_with(timer_methods, "rsltrace._core.TimerFields")},
   };
-  if (deque_append == NULL || deque_popleft == NULL || hash64 == NULL || zero == NULL ||
-      output_kind == NULL || call_back == NULL || callback_group == NULL ||
-      active_entity == NULL || user_callback == NULL || raw == NULL || admitted == NULL ||
-      draw_kind == NULL || no_sequence == NULL)
-    return -1;
+  if (PyErr_Occurred()) return -1;
   for (size_t i = 0; i < sizeof all / sizeof *all; ++i)
-    if (all[i].object == NULL || PyModule_AddObjectRef(module, all[i].name, all[i].object) < 0)
-      return -1;
+    if (PyModule_AddObjectRef(module, all[i].name, all[i].object) < 0) return -1;
   return 0;
 }
 

@@ -60,15 +60,15 @@ extern PyMemberDef loop_fields[], event_fields[], dispatcher_fields[], entity_fi
 
 #define FIELD_COUNT(Struct) ((sizeof(Struct) - sizeof(PyObject)) / sizeof(PyObject *))
 
-#define FIELDS(Struct, prefix)                                                       \
+#define OBJECTS(prefix, count)                                                       \
   static int prefix##_traverse(PyObject *self, visitproc visit, void *arg) {         \
     Py_VISIT(Py_TYPE(self));                                                         \
-    for (size_t i = 0; i < FIELD_COUNT(Struct); ++i)                                 \
+    for (size_t i = 0; i < (count); ++i)                                             \
       Py_VISIT(((PyObject **)(self + 1))[i]);                                        \
     return 0;                                                                        \
   }                                                                                  \
   static int prefix##_clear(PyObject *self) {                                        \
-    for (size_t i = 0; i < FIELD_COUNT(Struct); ++i)                                 \
+    for (size_t i = 0; i < (count); ++i)                                             \
       Py_CLEAR(((PyObject **)(self + 1))[i]);                                        \
     return 0;                                                                        \
   }                                                                                  \
@@ -78,7 +78,10 @@ extern PyMemberDef loop_fields[], event_fields[], dispatcher_fields[], entity_fi
     prefix##_clear(self);                                                            \
     PyObject_GC_Del(self);                                                           \
     Py_DECREF(type);                                                                 \
-  }                                                                                  \
+  }
+
+#define FIELDS(Struct, prefix)                                                       \
+  OBJECTS(prefix, FIELD_COUNT(Struct))                                               \
   static PyTypeObject *prefix##_made(PyMemberDef *fields,  PyMethodDef *methods) {   \
     PyType_Slot slots[] = {                                                          \
         {Py_tp_dealloc, prefix##_dealloc}, {Py_tp_traverse, prefix##_traverse},      \

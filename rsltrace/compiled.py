@@ -39,8 +39,12 @@ LinkFields = object
 PublisherFields = object
 SubscriptionFields = object
 SitesFields = object
+TimerFields = object
+TimerStateFields = object
+TimerQueueFields = object
 if core is not None and not TYPE_CHECKING:
     LoopFields, EventFields = core.LoopFields, core.EventFields
     EntityFields, PublisherFields = core.EntityFields, core.PublisherFields
     SubscriptionFields, SitesFields = core.SubscriptionFields, core.SitesFields
-    LinkFields = core.LinkFields
+    LinkFields, TimerFields = core.LinkFields, core.TimerFields
+    TimerStateFields, TimerQueueFields = core.TimerStateFields, core.TimerQueueFields

@@ -1,10 +1,13 @@
-"""Compiled handles of topics run callbacks and publish as the Python that they replace."""
+"""Compiled handles run callbacks and publish as the Python that they replace."""
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import sys
+import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -16,6 +19,7 @@ from std_msgs.msg import UInt64
 
 from rsltrace import NodeSpec
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.adapters.rclpy.handles.timers import TimerHandle
 from rsltrace.compiled import core
 from rsltrace.errors import RunError
 
@@ -89,6 +93,62 @@ class Changes(Node):
 def in_python(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SubscriptionHandle, "dispatch", SubscriptionHandle.dispatch_any)
     monkeypatch.setattr(PublisherHandle, "publish", PublisherHandle.publish_any)
+    monkeypatch.setattr(TimerHandle, "dispatch", TimerHandle.dispatch_any)
+
+
+class ChangesTimers(Node):
+    """Has timers of every kind, and changes them in their callbacks."""
+
+    def __init__(self, log: list[Any]) -> None:
+        super().__init__("changes_timers")
+        self.log = log
+        own = ReentrantCallbackGroup()
+        self.plain = self.create_timer(0.01, self.first)
+        self.other = self.create_timer(0.015, lambda: log.append("other"))
+        self.blocks = self.create_timer(0.02, self.late, callback_group=own)
+        self.gone = self.create_timer(0.01, self.leave)
+        self.create_timer(0.03, self.slowly)
+        self.create_timer(0.03, partial(log.append, "partial"), callback_group=own)
+        self.create_timer(0.0, self.always).cancel()
+        self.count = 0
+
+    def say(self, what: str) -> None:
+        self.count += 1
+        self.log.append(
+            (what, self.get_clock().now().nanoseconds, self.plain.time_until_next_call())
+        )
+
+    def first(self) -> None:
+        self.say("first")
+        self.plain.callback = self.second
+        if self.count % 3 == 0:
+            self.other.reset()
+
+    def second(self) -> None:
+        self.say("second")
+        self.plain.callback = self.first
+        self.plain.timer_period_ns = 10_000_000 + self.count * 100_000
+        if self.count % 5 == 0:
+            self.other.cancel()
+        elif self.other.is_canceled():
+            self.other.reset()
+        self.plain.handle.call_timer()
+
+    def late(self) -> None:
+        self.say("late")
+        time.sleep(0.013)
+        gc.collect()
+
+    def leave(self) -> None:
+        self.say("leave")
+        if self.count > 20:
+            self.destroy_timer(self.gone)
+
+    def always(self) -> None:
+        self.say("always")
+
+    async def slowly(self) -> None:
+        self.say("slowly")
 
 
 def _turn_by_turn(node: Node) -> None:
@@ -103,8 +163,19 @@ def _in_threads(node: Node) -> None:
 
 
 @pytest.mark.parametrize("spin", [None, rclpy.spin, _turn_by_turn, _in_threads])
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        (Changes, {"first", "second", "data", "leave", "slowly", "informed", "collect"}),
+        (ChangesTimers, {"first", "second", "late", "leave", "slowly"}),
+    ],
+)
 def test_callbacks_run_the_same(
-    simulate: Any, monkeypatch: pytest.MonkeyPatch, spin: Callable[[Node], None] | None
+    simulate: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    spin: Callable[[Node], None] | None,
+    kind: Callable[[list[Any]], Node],
+    expected: set[str],
 ) -> None:
     def run() -> tuple[list[Any], str]:
         log: list[Any] = []
@@ -112,16 +183,14 @@ def test_callbacks_run_the_same(
         def main() -> None:
             rclpy.init()
             assert spin is not None
-            spin(Changes(log))
+            spin(kind(log))
 
-        node = NodeSpec(node=lambda: Changes(log)) if spin is None else NodeSpec(main=main)
+        node = NodeSpec(node=lambda: kind(log)) if spin is None else NodeSpec(main=main)
         result = simulate(node, duration=1).result
         return log, result.digest
 
     compiled = run()
-    assert {"first", "second", "data", "leave", "slowly", "informed", "collect"} <= {
-        entry[0] for entry in compiled[0] if isinstance(entry, tuple)
-    }
+    assert expected <= {entry[0] for entry in compiled[0] if isinstance(entry, tuple)}
     in_python(monkeypatch)
     assert run() == compiled
 
@@ -179,6 +248,52 @@ def test_a_handle_that_has_lost_a_field_does_not_crash(simulate: Any, field: str
             delattr(self.sub.handle, field)
 
     with pytest.raises((AttributeError, RunError), match=field):
+        simulate(Breaks, duration=1)
+
+
+@pytest.mark.parametrize(
+    ("part", "field"),
+    [
+        ("handle", "entity_id"),
+        ("handle", "dispatcher"),
+        ("handle", "_callback"),
+        ("handle", "own_group"),
+        ("handle", "state"),
+        ("state", "deadline_ns"),
+        ("state", "period_ns"),
+        ("state", "order"),
+        ("queue", "_heap"),
+    ],
+)
+def test_a_timer_that_has_lost_a_field_does_not_crash(simulate: Any, part: str, field: str) -> None:
+    class Breaks(Node):
+        def __init__(self) -> None:
+            super().__init__("breaks")
+            self.timer = self.create_timer(0.1, self.tick)
+
+        def tick(self) -> None:
+            handle = self.timer.handle
+            queue = handle.dispatcher.loop.timers
+            delattr({"handle": handle, "state": handle.state, "queue": queue}[part], field)
+
+    missing = f"{field}|a part of the run is missing"
+    with pytest.raises((AttributeError, RunError, TypeError), match=missing):
+        simulate(Breaks, duration=1)
+
+
+@pytest.mark.parametrize("wrong", [None, [], [None], [(1, 2, 3)], [(1, 2, None)]])
+def test_a_queue_of_timers_that_is_none_does_not_crash(simulate: Any, wrong: Any) -> None:
+    class Breaks(Node):
+        def __init__(self) -> None:
+            super().__init__("breaks")
+            self.timer = self.create_timer(0.1, self.tick)
+
+        def tick(self) -> None:
+            queue = self.timer.handle.dispatcher.loop.timers
+            first = queue._heap[0]
+            queue._heap = wrong if wrong is None else [first, *wrong]
+
+    with contextlib.suppress(Exception):
         simulate(Breaks, duration=1)
 
 

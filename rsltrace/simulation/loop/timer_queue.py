@@ -10,20 +10,20 @@ from __future__ import annotations
 from heapq import heapify, heappop, heappush, heapreplace
 from typing import Any
 
+from rsltrace.compiled import TimerQueueFields, TimerStateFields
+
 # A timer's deadlines, with the arithmetic of rcl.
 #
 # Source of the rules: ``rcl/src/rcl/timer.c`` of rcl 9.2 (ROS 2 Jazzy). Deadlines stay on the grid
 # the timer was started on; periods that were missed are skipped, not made up for.
 
 
-class TimerState:
+class TimerState(TimerStateFields):
     """Period and deadline of one timer, in nanoseconds of simulated time.
 
     ``order`` is the creation order, the tie-breaker of equal deadlines. ``owner`` is what the loop
     dispatches when the timer is due. ``ticket`` belongs to the timer queue.
     """
-
-    __slots__ = ("canceled", "deadline_ns", "last_call_ns", "order", "owner", "period_ns", "ticket")
 
     def __init__(
         self, period_ns: int, now_ns: int, *, order: int, owner: object, canceled: bool = False
@@ -61,7 +61,7 @@ NEVER_NS = 1 << 64
 _ROOM = 256
 
 
-class CreationOrderQueue:
+class CreationOrderQueue(TimerQueueFields):
     """The running timers, smallest (deadline, creation order) first. O(log n) for every change.
 
     The loop reads the first timer far more often than timers change, so it is kept up to date.

@@ -5,19 +5,20 @@ from __future__ import annotations
 import inspect
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.adapters.rclpy.concurrency.callback_groups import is_busy
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
 from rsltrace.adapters.rclpy.handles.clock import ClockHandle
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle
+from rsltrace.compiled import TimerFields, core
 from rsltrace.simulation.middleware.timer import TIMER, Timer
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 
 
-class TimerHandle(EntityHandle, Timer):
+class TimerHandle(EntityHandle, Timer, TimerFields):
     """Stands in for ``_rclpy.Timer``. It runs once a running node lists it."""
 
     lists = "timers"
@@ -29,7 +30,7 @@ class TimerHandle(EntityHandle, Timer):
         self._real = real
         self._callback: Any = None
         self._coroutine = False
-        self._info: str | None = None
+        self._with_info: Any = False
         Timer.__init__(self, runtime.dispatcher, None, int(period_ns), canceled=not autostart)
 
     activate = Timer.activate
@@ -38,7 +39,8 @@ class TimerHandle(EntityHandle, Timer):
         super().deactivate()
         self.dispatcher.loop.timers.remove(self.state)
 
-    def dispatch(self) -> None:
+    def dispatch_any(self) -> None:
+        """Run the callback of a due timer, if it may run, and set its next deadline."""
         wrapper = self.wrapper
         dispatcher = self.dispatcher
         loop = dispatcher.loop
@@ -63,10 +65,10 @@ class TimerHandle(EntityHandle, Timer):
         if callback is not self._callback:
             self._callback = callback
             self._coroutine = is_awaited(self.runtime, callback)
-            self._info = _info_parameter(callback)
+            self._with_info = _info_parameter(callback) or False
         digest = self.deadline_hash()
-        if self._info is not None:
-            callback = partial(callback, **{self._info: self._timer_info()})
+        if self._with_info:
+            callback = partial(callback, **{self._with_info: self._timer_info()})
         state.call(loop.now_ns)
         loop.timers.ran(state)
         if self._coroutine:
@@ -75,6 +77,13 @@ class TimerHandle(EntityHandle, Timer):
             dispatcher.execute(
                 self, self.entity_id, self.node, TIMER, callback, (), NO_EVENT, 0, digest
             )
+
+    if core is None or TYPE_CHECKING:
+        dispatch = dispatch_any
+    else:
+        dispatch = core.TimerFields.dispatch
+        """Does the usual case, a free group and a plain function of a node that the loop runs, and
+        leaves the others to ``dispatch_any``."""
 
     def forget_callback(self) -> None:
         """Look up how to run the callback again."""
