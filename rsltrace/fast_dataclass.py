@@ -1,15 +1,17 @@
-"""``dataclass(frozen=True, slots=True)`` in a tenth of the time: a command makes a hundred of them.
+"""``dataclass`` in a tenth of the time: a command makes a hundred of them.
 
-Python's compiles seven functions for each class. Here one ``__init__`` is compiled for each number
-of fields and copied with their names, and the rest is shared. What ``dataclasses.fields`` tells is
-made when it is asked for. Comparing objects takes longer, so classes of events and messages are
-Python's. Type checkers see Python's.
+Python's compiles up to seven functions for each class. Here one ``__init__`` is compiled for each
+number of fields and copied with their names, and the rest is shared. What ``dataclasses.fields``
+tells is made when it is asked for. Comparing objects takes longer, so classes of events and
+messages are Python's. Type checkers see Python's.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import typing
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, partial
 from operator import attrgetter
 from types import FunctionType
@@ -19,41 +21,69 @@ if TYPE_CHECKING:
     from dataclasses import dataclass as dataclass
 else:
 
-    def dataclass(cls=None, /, **options):
+    def dataclass(cls=None, /, *, eq=True, frozen=False, slots=False, **others):
         """Return a class or a decorator of classes, as Python's does."""
-        if options != {"frozen": True, "slots": True}:
-            return dataclasses.dataclass(cls, **options)
-        return _decorate
+        if others:
+            return _pythons(cls, eq=eq, frozen=frozen, slots=slots, **others)
+        options = {"eq": eq, "frozen": frozen, "slots": slots}
+        return partial(_decorate, **options) if cls is None else _decorate(cls, **options)
 
 
-_slotted = dataclasses.dataclass(eq=False, repr=False, slots=True)
+_pythons = dataclasses.dataclass
 _assign = object.__setattr__
 _NO_DEFAULT = object()
 
 
-def _decorate(cls: Any) -> Any:
+@contextmanager
+def quick_imports() -> Iterator[None]:
+    """Let packages that are imported make their dataclasses so, too, and compile equal annotations
+    once: both are a third of pydantic's import."""
+    compiled: Any = typing
+    compiled.compile = cache(compile)
+    dataclasses.dataclass = dataclass
+    try:
+        yield
+    finally:
+        dataclasses.dataclass = _pythons
+        del compiled.compile
+
+
+def _decorate(cls: Any, *, eq: bool, frozen: bool, slots: bool) -> Any:
     body = {k: v for k, v in vars(cls).items() if k not in ("__dict__", "__weakref__")}
     inherited = getattr(cls, "_plain_fields", None) or {}
     fields = _plain_fields(cls, body)
+    made = cls
     if fields is None:
-        made = _slotted(cls)
+        own_init = frozen and not slots  # it must set what the class has, its defaults
+        made = _pythons(eq=False, repr=False, frozen=own_init, slots=slots)(cls)
         compared = [field.name for field in dataclasses.fields(made) if field.compare]
     else:
         compared = [*fields]
-        init = _init(tuple(fields), tuple(v for v in fields.values() if v is not _NO_DEFAULT))
+        defaults = tuple(v for v in fields.values() if v is not _NO_DEFAULT)
+        init = _init(tuple(fields), defaults, frozen=frozen)
         init.__qualname__ = f"{cls.__qualname__}.__init__"
         own = {
-            "__slots__": [name for name in fields if name not in inherited],
             "__init__": init,
             "__match_args__": tuple(fields),
             "__dataclass_fields__": _Description(
                 partial(cls.__class__, cls.__name__, cls.__bases__, body)
             ),
         }
-        kept = {k: v for k, v in body.items() if k not in fields}
-        made = cls.__class__(cls.__name__, cls.__bases__, own | kept)
-        made.__qualname__ = cls.__qualname__
-    for name, value in _SHARED.items():
+        if slots:
+            kept = {k: v for k, v in body.items() if k not in fields}
+            own["__slots__"] = [name for name in fields if name not in inherited]
+            made = cls.__class__(cls.__name__, cls.__bases__, own | kept)
+            made.__qualname__ = cls.__qualname__
+        else:
+            for name, value in own.items():
+                setattr(made, name, value)
+            vars(made)["__dataclass_fields__"].__set_name__(made, "")
+    shared: dict[str, Any] = {"__repr__": _text}
+    if eq:
+        shared |= {"__eq__": _equal, "__hash__": _hash if frozen else None}
+    if frozen:
+        shared |= {"__setattr__": _set, "__delattr__": _delete}
+    for name, value in shared.items():
         if name not in vars(made):
             setattr(made, name, value)
     made._plain_fields = fields
@@ -91,27 +121,31 @@ class _Description:
         self._owner = owner
 
     def __get__(self, instance: object, cls: type) -> Any:
-        made: Any = _slotted(self._plain())
+        made: Any = _pythons(eq=False, repr=False, slots=True)(self._plain())
         self._owner.__dataclass_params__ = made.__dataclass_params__  # type: ignore[attr-defined]
         self._owner.__dataclass_fields__ = made.__dataclass_fields__  # type: ignore[attr-defined]
         return made.__dataclass_fields__
 
 
-def _init(names: tuple[str, ...], defaults: tuple[object, ...]) -> FunctionType:
+def _init(names: tuple[str, ...], defaults: tuple[object, ...], *, frozen: bool) -> FunctionType:
     """Return an ``__init__`` that sets the attributes of these names."""
-    code = _template(len(names)).__code__
+    code = _template(len(names), frozen).__code__
     given = {f"_{place}": name for place, name in enumerate(names)}
     code = code.replace(
         co_varnames=("self", *names),
+        co_names=tuple(given.get(name, name) for name in code.co_names),
         co_consts=tuple(given.get(constant, constant) for constant in code.co_consts),
     )
     return FunctionType(code, globals(), "__init__", defaults)
 
 
 @cache
-def _template(count: int) -> FunctionType:
+def _template(count: int, frozen: bool) -> FunctionType:
     names = [f"_{place}" for place in range(count)]
-    lines = [f"    _assign(self, {name!r}, {name})" for name in names]
+    lines = [
+        f"    _assign(self, {name!r}, {name})" if frozen else f"    self.{name} = {name}"
+        for name in names
+    ]
     made: dict[str, FunctionType] = {}
     exec("\n".join([f"def __init__({', '.join(['self', *names])}):", *lines, "    pass"]), made)
     return made["__init__"]
@@ -139,19 +173,12 @@ def _text(self: Any) -> str:
 
 
 def _set(self: Any, name: str, value: object) -> None:
-    if hasattr(self, name):  # what __init__ has not set yet is not
+    body = vars(type(self))
+    # Slots that are not there yet are set by copies, and by an __init__ of Python.
+    if hasattr(self, name) or ("_compared" in body and "__slots__" not in body):
         raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
     object.__setattr__(self, name, value)
 
 
 def _delete(self: Any, name: str) -> None:
     raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
-
-
-_SHARED = {
-    "__eq__": _equal,
-    "__hash__": _hash,
-    "__repr__": _text,
-    "__setattr__": _set,
-    "__delattr__": _delete,
-}

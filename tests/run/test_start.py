@@ -10,7 +10,8 @@ import inspect
 import pickle
 import subprocess
 import sys
-from contextlib import suppress
+import typing
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +103,11 @@ class Kept:
     b: tuple[int, ...]
 
 
-def test_a_quick_dataclass_is_one_of_pythons() -> None:
-    options = {"frozen": True, "slots": True}
+@pytest.mark.parametrize("eq", [True, False])
+@pytest.mark.parametrize("frozen", [True, False])
+@pytest.mark.parametrize("slots", [True, False])
+def test_a_quick_dataclass_is_one_of_pythons(eq: bool, frozen: bool, slots: bool) -> None:
+    options = {"eq": eq, "frozen": frozen, "slots": slots}
     annotations = {"a": int, "b": list[int], "c": int}
     for names in (["a", "b", "c"], ["a"], []):
         given = {name: annotations[name] for name in names}
@@ -113,31 +117,35 @@ def test_a_quick_dataclass_is_one_of_pythons() -> None:
             make(**options)(type("Made", (), dict(body)))
             for make in (fast_dataclass.dataclass, dataclasses.dataclass)
         )
+        assert (quick.__hash__ is None) is (own.__hash__ is None)
         values = [[1, (2,)], [1, (2,), 4], [2, (2,)]] if len(names) == 3 else [[1], [2]]
         values = values if names else [[]]
         for one in values:
             assert repr(quick(*one)) == repr(own(*one))
-            assert hash(quick(*one)) == hash(own(*one))
+            if eq and frozen:
+                assert hash(quick(*one)) == hash(own(*one))
             assert quick(*one) != own(*one)
             for other in values:
                 assert (quick(*one) == quick(*other)) is (own(*one) == own(*other))
         assert [field.name for field in dataclasses.fields(quick)] == names
         made = quick(*values[0])
-        assert not hasattr(made, "__dict__")
+        assert hasattr(made, "__dict__") is not slots
         for name in names:
-            with pytest.raises(dataclasses.FrozenInstanceError):
+            with pytest.raises(dataclasses.FrozenInstanceError) if frozen else nullcontext():
                 setattr(made, name, 0)
-            with pytest.raises(dataclasses.FrozenInstanceError):
+            assert (getattr(made, name) == 0) is not frozen
+            with pytest.raises(dataclasses.FrozenInstanceError) if frozen else nullcontext():
                 delattr(made, name)
         assert (
             pickle.loads(pickle.dumps(Kept(1, (2,)))) == Kept(1, (2,)) == copy.copy(Kept(1, (2,)))
         )
 
 
+@pytest.mark.parametrize("slots", [True, False])
 @pytest.mark.parametrize("given", [(), (1,), (1, 2), (1, 2, 3, 4, 5), {"a": 1, "c": 2, "b": 3}])
-def test_a_quick_dataclass_inherits_fields_as_pythons_does(given: Any) -> None:
+def test_a_quick_dataclass_inherits_fields_as_pythons_does(given: Any, slots: bool) -> None:
     def family(decorate: Any) -> list[Any]:
-        @decorate(frozen=True, slots=True)
+        @decorate(frozen=True, slots=slots)
         class Base:
             a: int
             b: int
@@ -145,14 +153,14 @@ def test_a_quick_dataclass_inherits_fields_as_pythons_does(given: Any) -> None:
             def total(self) -> int:
                 return self.a + self.b
 
-        @decorate(frozen=True, slots=True)
+        @decorate(frozen=True, slots=slots)
         class Derived(Base):
             """What it is."""
 
             c: int = 7
             a: str
 
-        @decorate(frozen=True, slots=True)
+        @decorate(frozen=True, slots=slots)
         class Empty(Derived):
             pass
 
@@ -174,8 +182,30 @@ def test_a_quick_dataclass_inherits_fields_as_pythons_does(given: Any) -> None:
     quick, own = family(fast_dataclass.dataclass), family(dataclasses.dataclass)
     for one, other in zip(quick, own, strict=True):
         assert told(one) == told(other)
-        assert one.__slots__ == list(other.__slots__)
+        if slots:
+            assert one.__slots__ == list(other.__slots__)
         assert list(inspect.signature(one).parameters) == list(inspect.signature(other).parameters)
+
+
+def test_packages_that_are_imported_quickly_have_dataclasses_as_pythons(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "made_quickly.py").write_text(
+        "import dataclasses, typing\n"
+        "@dataclasses.dataclass(kw_only=True)\nclass Own:\n    a: int\n"
+        "@dataclasses.dataclass\nclass Quick:\n    a: typing.Optional['int'] = 2\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    before = dataclasses.dataclass
+    with fast_dataclass.quick_imports():
+        made = importlib.import_module("made_quickly")
+    assert dataclasses.dataclass is before
+    assert not hasattr(typing, "compile")
+    assert "_compared" in vars(made.Quick)
+    assert "_compared" not in vars(made.Own)
+    assert repr(made.Own(a=1)) == "Own(a=1)"
+    assert repr(made.Quick()) == "Quick(a=2)"
+    assert typing.get_type_hints(made.Quick) == {"a": int | None}
 
 
 def test_versions_are_those_of_the_packages_metadata() -> None:

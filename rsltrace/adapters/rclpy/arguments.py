@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -18,6 +17,7 @@ from rsltrace.adapters.rclpy.parameter_overrides import (
     ParameterFault,
     ParameterOverrides,
 )
+from rsltrace.fast_dataclass import dataclass
 
 
 class InvalidArgumentsError(ValueError):

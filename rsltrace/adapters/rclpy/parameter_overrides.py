@@ -19,14 +19,15 @@ _BOOL = {
     **dict.fromkeys("Y y yes Yes YES true True TRUE on On ON".split(), True),
     **dict.fromkeys("N n no No NO false False FALSE off Off OFF".split(), False),
 }
-_INTEGER = re.compile(r"\s*([+-]?)(?:0[xX]([0-9a-fA-F]+)|(0[0-7]*)|([1-9][0-9]*))", re.ASCII)
+# Compiled for the first override: few runs have one.
+_INTEGER = r"(?a)\s*([+-]?)(?:0[xX]([0-9a-fA-F]+)|(0[0-7]*)|([1-9][0-9]*))"
 _BASES = (16, 8, 10)
-_DECIMAL = re.compile(r"\s*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
-_HEXADECIMAL = re.compile(
-    r"\s*[+-]?0[xX](?:[0-9a-fA-F]+\.?[0-9a-fA-F]*|\.[0-9a-fA-F]+)(?:[pP][+-]?[0-9]+)?", re.ASCII
+_DECIMAL = r"(?a)\s*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_HEXADECIMAL = (
+    r"(?a)\s*[+-]?0[xX](?:[0-9a-fA-F]+\.?[0-9a-fA-F]*|\.[0-9a-fA-F]+)(?:[pP][+-]?[0-9]+)?"
 )
-_NO_NUMBER = re.compile(r"\s*([+-]?)(?:(inf(?:inity)?)|nan(?:\([0-9a-z_]*\))?)", re.ASCII | re.I)
-_OF_YAML = re.compile(r"([+-]?)\.(?:(inf|Inf|INF))|\.(?:nan|NaN|NAN)")
+_NO_NUMBER = r"(?ai)\s*([+-]?)(?:(inf(?:inity)?)|nan(?:\([0-9a-z_]*\))?)"
+_OF_YAML = r"([+-]?)\.(?:(inf|Inf|INF))|\.(?:nan|NaN|NAN)"
 _SMALLEST_NORMAL = 2.0**-1022
 
 _TYPES = {bool: "bool", int: "integer", float: "double", str: "string"}
@@ -46,13 +47,13 @@ def scalar(text: str) -> bool | int | float | str:
     """Return what ROS takes an unquoted scalar for."""
     if text in _BOOL:
         return _BOOL[text]
-    if found := _INTEGER.fullmatch(text):
+    if found := re.fullmatch(_INTEGER, text):
         digits = zip(found.groups()[1:], _BASES, strict=True)
         number = next(int(word, base) for word, base in digits if word is not None)
         number = -number if found[1] == "-" else number
         if -(2**63) <= number < 2**63:
             return number
-    if found := _OF_YAML.fullmatch(text) or _NO_NUMBER.fullmatch(text):
+    if found := re.fullmatch(_OF_YAML, text) or re.fullmatch(_NO_NUMBER, text):
         value = float("inf" if found[2] else "nan")
         return -value if found[1] == "-" else value
     double = _double(text)
@@ -62,9 +63,9 @@ def scalar(text: str) -> bool | int | float | str:
 def _double(text: str) -> float | None:
     """Read a number as ``strtod`` does; None if it is none, or not in the range of a double."""
     try:
-        if _DECIMAL.fullmatch(text):
+        if re.fullmatch(_DECIMAL, text):
             value = float(text)
-        elif _HEXADECIMAL.fullmatch(text):
+        elif re.fullmatch(_HEXADECIMAL, text):
             value = float.fromhex(text.strip())
         else:
             return None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +16,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from rsltrace.errors import JobError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import shorthand_at, without_alternatives
 from rsltrace.job.parts.part import JobPart

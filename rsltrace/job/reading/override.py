@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from rsltrace.errors import did_you_mean
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import is_list_at, shorthand_at, without_alternatives
 from rsltrace.job.reading.yaml_source import (

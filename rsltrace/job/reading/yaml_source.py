@@ -7,7 +7,6 @@ constructor throws away: the text of each number, the place of each key, and key
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -16,6 +15,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from rsltrace.errors import JobError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.times import ExactFloat
 from rsltrace.trace.model.operation import NESTING_MAX, nested_too_deep
 

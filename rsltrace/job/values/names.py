@@ -12,30 +12,31 @@ from typing import Any
 NODE_NAME_LENGTH_MAX = 255
 NAMESPACE_LENGTH_MAX = 245
 
+# Compiled when a job has such a name: all of them take as long as the rest of reading a job.
 _PART = r"[A-Za-z_][A-Za-z0-9_]*"
-_NODE_NAME = re.compile(_PART, re.ASCII)
-_NAMESPACE = re.compile(rf"/|(?:/{_PART})+", re.ASCII)
-_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*", re.ASCII)
-_TOPIC = re.compile(rf"(?:/{_PART})+", re.ASCII)
-_FIELD_PATH = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:\.[A-Za-z][A-Za-z0-9_]*)*", re.ASCII)
+_NODE_NAME = rf"(?a){_PART}"
+_NAMESPACE = rf"(?a)/|(?:/{_PART})+"
+_VARIABLE = r"(?a)[A-Za-z_][A-Za-z0-9_-]*"
+_TOPIC = rf"(?a)(?:/{_PART})+"
+_FIELD_PATH = r"(?a)[A-Za-z][A-Za-z0-9_]*(?:\.[A-Za-z][A-Za-z0-9_]*)*"
 
 # In a remapping rule rcl's lexer knows no double underscores inside a name.
 _TOKEN = rf"(?![A-Za-z0-9_]*__){_PART}"
 _RULE_NAME = rf"(?:~/|/)?{_TOKEN}(?:/{_TOKEN})*"
-_REMAP_FROM = re.compile(rf"(?:{_TOKEN}:)?(?:rostopic://|rosservice://)?{_RULE_NAME}", re.ASCII)
-_REMAP_TO = re.compile(_RULE_NAME, re.ASCII)
+_REMAP_FROM = rf"(?a)(?:{_TOKEN}:)?(?:rostopic://|rosservice://)?{_RULE_NAME}"
+_REMAP_TO = rf"(?a){_RULE_NAME}"
 
 _MODULE = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
-_TARGET = re.compile(rf"{_MODULE}:{_MODULE}")
-_FILE_TARGET = re.compile(rf"(?:\./)?((?:[^\W\d]\w*/)*[^\W\d]\w*)\.py:({_MODULE})")
-_MODULE_NAME = re.compile(_MODULE)
-_EXECUTABLE = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+", re.ASCII)
-_COMPONENT = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z_]\w*(?:(?:::|[.:])[A-Za-z_]\w*)*", re.ASCII)
+_TARGET = rf"{_MODULE}:{_MODULE}"
+_FILE_TARGET = rf"(?:\./)?((?:[^\W\d]\w*/)*[^\W\d]\w*)\.py:({_MODULE})"
+_MODULE_NAME = _MODULE
+_EXECUTABLE = r"(?a)[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+"
+_COMPONENT = r"(?a)[A-Za-z0-9_.-]+/[A-Za-z_]\w*(?:(?:::|[.:])[A-Za-z_]\w*)*"
 
 
 def check_node_name(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` can be a ROS node name."""
-    if not _NODE_NAME.fullmatch(name):
+    if not re.fullmatch(_NODE_NAME, name):
         raise ValueError(
             f"{name!r} is not a node name: use letters, digits and '_', not starting with a digit"
         )
@@ -47,9 +48,9 @@ def check_node_name(name: str) -> None:
 
 def check_namespace(namespace: str) -> None:
     """Raise ``ValueError`` unless ``namespace`` can be a ROS namespace: ``/`` or ``/a/b``."""
-    if not namespace.startswith("/") and _NAMESPACE.fullmatch(f"/{namespace}"):
+    if not namespace.startswith("/") and re.fullmatch(_NAMESPACE, f"/{namespace}"):
         raise ValueError(f"a namespace starts with '/': write '/{namespace}'")
-    if not _NAMESPACE.fullmatch(namespace):
+    if not re.fullmatch(_NAMESPACE, namespace):
         raise ValueError(
             f"{namespace!r} is not a namespace: parts of letters, digits and '_', none starting "
             "with a digit, after one '/' each and with none at the end"
@@ -63,9 +64,9 @@ def check_namespace(namespace: str) -> None:
 
 def check_topic(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` is a fully qualified topic name."""
-    if not name.startswith("/") and _TOPIC.fullmatch(f"/{name}"):
+    if not name.startswith("/") and re.fullmatch(_TOPIC, f"/{name}"):
         raise ValueError(f"a topic is named in full, from '/': write '/{name}'")
-    if not _TOPIC.fullmatch(name):
+    if not re.fullmatch(_TOPIC, name):
         raise ValueError(
             f"{name!r} is not a topic name: parts of letters, digits and '_', none starting with "
             "a digit, after one '/' each, as in /robot/scan"
@@ -74,21 +75,21 @@ def check_topic(name: str) -> None:
 
 def check_container(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` is a node's name in full."""
-    if not name.startswith("/") and _TOPIC.fullmatch(f"/{name}"):
+    if not name.startswith("/") and re.fullmatch(_TOPIC, f"/{name}"):
         raise ValueError(f"a node is named in full here, from '/': write '/{name}'")
-    if not _TOPIC.fullmatch(name):
+    if not re.fullmatch(_TOPIC, name):
         raise ValueError(f"{name!r} is not the name of a node in full, as in /camera/container")
 
 
 def check_field_path(path: str) -> None:
     """Raise ``ValueError`` unless ``path`` is a field of a message: ``data``, ``header.seq``."""
-    if not _FIELD_PATH.fullmatch(path):
+    if not re.fullmatch(_FIELD_PATH, path):
         raise ValueError(f"{path!r} is not a field: write its name, or a path such as status.code")
 
 
 def check_target(target: str) -> None:
     """Raise ``ValueError`` unless ``target`` looks like ``module:Class`` (dots in both parts)."""
-    if not _TARGET.fullmatch(target) or target.partition(":")[0].endswith(".py"):
+    if not re.fullmatch(_TARGET, target) or target.partition(":")[0].endswith(".py"):
         raise ValueError(
             f"expected module:Class or module:function, got {target!r}{_as_target(target)}"
         )
@@ -97,7 +98,7 @@ def check_target(target: str) -> None:
 def dotted_target(target: str) -> str:
     """Return ``path/to/file.py:Class`` as ``path.to.file:Class``, which is the same module seen
     from the job's folder; another text as it is."""
-    found = _FILE_TARGET.fullmatch(target)
+    found = re.fullmatch(_FILE_TARGET, target)
     return target if found is None else f"{found[1].replace('/', '.')}:{found[2]}"
 
 
@@ -111,18 +112,18 @@ def _as_target(text: str) -> str:
         module = path.removesuffix(".py").replace("/", ".").strip(".")
         return f"; a module is named with dots: {module}:{attribute or 'Class'}"
     module, dot, last = text.rpartition(".")
-    return f"; write {module}:{last}" if dot and _TARGET.fullmatch(f"{module}:{last}") else ""
+    return f"; write {module}:{last}" if dot and re.fullmatch(_TARGET, f"{module}:{last}") else ""
 
 
 def check_executable(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` looks like ``package/executable``."""
-    if not _EXECUTABLE.fullmatch(name):
+    if not re.fullmatch(_EXECUTABLE, name):
         raise ValueError(f"expected package/executable (as ros2 run has them), got {name!r}")
 
 
 def check_component(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` looks like ``package/name::Class``."""
-    if not _COMPONENT.fullmatch(name):
+    if not re.fullmatch(_COMPONENT, name):
         raise ValueError(
             "expected package/plugin (as ros2 component types has them, package/name::Class), got "
             f"{name!r}"
@@ -131,7 +132,7 @@ def check_component(name: str) -> None:
 
 def check_module(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` looks like ``package.module``."""
-    if not _MODULE_NAME.fullmatch(name) or name.endswith(".py"):
+    if not re.fullmatch(_MODULE_NAME, name) or name.endswith(".py"):
         path = name.partition(":")[0]
         hint = f"; a file is named by 'script: {name}'" if path.endswith(".py") else ""
         hint = hint or (f"; a function is named by 'main: {name}'" if ":" in name else "")
@@ -140,7 +141,7 @@ def check_module(name: str) -> None:
 
 def check_variable(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` can be a variable of a job."""
-    if not _VARIABLE.fullmatch(name):
+    if not re.fullmatch(_VARIABLE, name):
         raise ValueError(
             f"{name!r} is not a variable's name: use letters, digits, '_' and '-', not starting "
             "with a digit"
@@ -152,7 +153,7 @@ def check_remap_from(name: str) -> None:
     if name in ("__node", "__name", "__ns"):
         key = "namespace" if name == "__ns" else "name"
         raise ValueError(f"{name} is not a topic or service: use the node's '{key}:' instead")
-    if not _REMAP_FROM.fullmatch(name):
+    if not re.fullmatch(_REMAP_FROM, name):
         raise ValueError(
             f"rcl cannot remap {name!r}: write a topic or service name such as chatter, "
             "/robot/chatter or ~/chatter (no wildcards, no '__')"
@@ -161,7 +162,7 @@ def check_remap_from(name: str) -> None:
 
 def check_remap_to(name: str) -> None:
     """Raise ``ValueError`` unless rcl accepts ``name`` on the right of a remapping rule."""
-    if not _REMAP_TO.fullmatch(name):
+    if not re.fullmatch(_REMAP_TO, name):
         raise ValueError(
             f"rcl cannot remap to {name!r}: write a topic or service name such as chatter, "
             "/robot/chatter or ~/chatter (no wildcards, no '__', no '/' at the end)"

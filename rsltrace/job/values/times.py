@@ -7,12 +7,12 @@ written as: from the YAML source (``ExactFloat``) or from a Python float's ``rep
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from typing import NamedTuple
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 

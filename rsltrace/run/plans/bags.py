@@ -6,12 +6,12 @@ import heapq
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import BagError, SetupError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job import Job, locate
 from rsltrace.job.values.names import check_topic
 from rsltrace.run.plans.faults import BagFaults, check_changes

@@ -13,7 +13,6 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from operator import attrgetter
 from pathlib import Path
@@ -30,6 +29,7 @@ from rsltrace.adapters.workspace.imports import (
     unbuilt_programs,
 )
 from rsltrace.errors import JobError, nearest
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.virtual.user_modules import code_of_script
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.scheduling import load_target

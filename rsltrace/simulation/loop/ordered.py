@@ -8,11 +8,11 @@ separate loop so that the plain one does not pay for it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from heapq import heappop
 from typing import Any
 
 from rsltrace.errors import RunError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.loop.policy import (
     Candidate,

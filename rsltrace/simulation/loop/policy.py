@@ -7,11 +7,11 @@ and chooses one. ``docs/policies.md`` shows how to write one.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, Protocol
 
 from rsltrace.errors import RunError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.trace.model.texts import format_seconds
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from rsltrace.errors import RunError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.loop.ordered import OrderedLoop, ReadyItem
 from rsltrace.simulation.loop.policy import Candidate, ChoicePoint, FifoUntil
 from rsltrace.simulation.loop.timer_queue import NEVER_NS, TimerState

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.middleware.entity import Receiver, callback_name
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.publisher import Transport

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.records import (
     MAGIC,

@@ -13,58 +13,91 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import zstandard
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 
 from rsltrace.errors import OutputError
 from rsltrace.trace.mcap.checksum import crc32, crc_of, joined_crc
 from rsltrace.trace.mcap.chunk_builder import ChunkBody
-from rsltrace.trace.mcap.records import MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
+from rsltrace.trace.mcap.records import (
+    MAGIC,
+    MESSAGE_ENCODING,
+    RECORD_HEAD,
+    SCHEMA_ENCODING,
+    McapChannel,
+    McapSchema,
+)
 from rsltrace.trace.mcap.sink import Sink
 
-# The end of an MCAP file, where readers look first. The writer reports each record, and the summary
-# keeps what it needs in its final form.
-
-_FOOTER_BEFORE_CRC = struct.Struct("<BQQQ")
+_U32 = struct.Struct("<I")
+_U64 = struct.Struct("<Q")
+_NUMBERED = struct.Struct("<HQ")
+_IDS = struct.Struct("<HH")
+_CHUNK_HEAD = struct.Struct("<QQQI")
+_CHUNK_INDEX_HEAD = struct.Struct("<QQQQ")
+_CHUNK_SIZES = struct.Struct("<QQ")
+_ATTACHMENT_TIMES = struct.Struct("<QQ")
+_ATTACHMENT_INDEX_HEAD = struct.Struct("<QQQQQ")
+_STATISTICS_HEAD = struct.Struct("<QHIIIIQQ")
+_SUMMARY_OFFSET = struct.Struct("<BQQ")
+_FOOTER = struct.Struct("<QQ")
 _FOOTER_BYTES = 20
 
 
-def record_bytes(record: McapRecord) -> bytes:
-    """Return ``record`` as in the file, opcode and length included."""
-    builder = RecordBuilder()
-    record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]  # mcap leaves it bare
+def _record(opcode: Opcode, *fields: bytes) -> bytes:
+    """Return a record as in the file. The ``mcap`` package has classes of them, which take as long
+    to import as a short run takes to write."""
+    body = b"".join(fields)
+    return RECORD_HEAD.pack(opcode, len(body)) + body
+
+
+def _bytes(data: bytes) -> bytes:
+    return _U32.pack(len(data)) + data
+
+
+def _text(text: str) -> bytes:
+    return _bytes(text.encode())
+
+
+def _texts(mapping: Mapping[str, str]) -> bytes:
+    return _bytes(b"".join(_text(key) + _text(value) for key, value in mapping.items()))
+
+
+def _numbers(mapping: Mapping[int, int]) -> bytes:
+    return _bytes(b"".join(_NUMBERED.pack(key, value) for key, value in mapping.items()))
+
+
+def _schema(schema: McapSchema) -> bytes:
+    fields = schema.name, schema.encoding, schema.text
+    return _record(Opcode.SCHEMA, schema.id.to_bytes(2, "little"), *map(_text, fields))
+
+
+def _channel(channel: McapChannel) -> bytes:
+    return _record(
+        Opcode.CHANNEL,
+        _IDS.pack(channel.id, channel.schema_id),
+        _text(channel.topic),
+        _text(channel.message_encoding),
+        _texts(channel.metadata),
+    )
+
+
+# The end of an MCAP file, where readers look first. The writer reports each record, and the summary
+# keeps what it needs in its final form.
 
 
 class SummaryBuilder:
     """Collects the summary section. Memory: about 100 bytes per chunk."""
 
     def __init__(self) -> None:
-        self.schemas: list[Schema] = []
-        self.channels: list[Channel] = []
+        self.schemas: list[McapSchema] = []
+        self.channels: list[McapChannel] = []
         self.message_counts: dict[int, int] = {}
         self.start_ns = 0
         self.end_ns = 0
         self._chunk_count = 0
         self._chunk_indexes = bytearray()
-        self._attachment_indexes: list[AttachmentIndex] = []
-        self._metadata_indexes: list[MetadataIndex] = []
+        self._attachment_indexes: list[bytes] = []
+        self._metadata_indexes: list[bytes] = []
 
     @property
     def message_count(self) -> int:
@@ -86,79 +119,68 @@ class SummaryBuilder:
             index_offsets[channel_id] = position
             position += len(record)
             self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
-        index = ChunkIndex(
-            chunk_length=length,
-            chunk_start_offset=offset,
-            compression=compression,
-            compressed_size=compressed_size,
-            message_end_time=body.end_ns,
-            message_index_length=position - offset - length,
-            message_index_offsets=index_offsets,
-            message_start_time=body.start_ns,
-            uncompressed_size=body.size,
-        )
         # Kept as bytes: a long run has a million chunks, and objects would be ten times as large.
-        self._chunk_indexes += record_bytes(index)
+        self._chunk_indexes += _record(
+            Opcode.CHUNK_INDEX,
+            _CHUNK_INDEX_HEAD.pack(body.start_ns, body.end_ns, offset, length),
+            _numbers(index_offsets),
+            _U64.pack(position - offset - length),
+            _text(compression),
+            _CHUNK_SIZES.pack(compressed_size, body.size),
+        )
 
     def add_attachment(
         self, name: str, media_type: str, *, size: int, offset: int, length: int
     ) -> None:
         """Add an attachment of ``size`` bytes whose record is at ``offset``."""
+        head = _ATTACHMENT_INDEX_HEAD.pack(offset, length, 0, 0, size)
         self._attachment_indexes.append(
-            AttachmentIndex(
-                offset=offset,
-                length=length,
-                log_time=0,
-                create_time=0,
-                data_size=size,
-                name=name,
-                media_type=media_type,
-            )
+            _record(Opcode.ATTACHMENT_INDEX, head, _text(name), _text(media_type))
         )
 
     def add_metadata(self, name: str, *, offset: int, length: int) -> None:
         """Add a metadata record at ``offset``."""
-        self._metadata_indexes.append(MetadataIndex(offset=offset, length=length, name=name))
+        self._metadata_indexes.append(
+            _record(Opcode.METADATA_INDEX, _U64.pack(offset), _U64.pack(length), _text(name))
+        )
 
     def tail(self, summary_start: int) -> bytes:
         """Return summary section and footer of a file whose data section ends here."""
-        statistics = Statistics(
-            attachment_count=len(self._attachment_indexes),
-            channel_count=len(self.channels),
-            channel_message_counts=dict(sorted(self.message_counts.items())),
-            chunk_count=self._chunk_count,
-            message_count=self.message_count,
-            message_end_time=self.end_ns,
-            message_start_time=self.start_ns,
-            metadata_count=len(self._metadata_indexes),
-            schema_count=len(self.schemas),
+        head = _STATISTICS_HEAD.pack(
+            self.message_count,
+            len(self.schemas),
+            len(self.channels),
+            len(self._attachment_indexes),
+            len(self._metadata_indexes),
+            self._chunk_count,
+            self.start_ns,
+            self.end_ns,
         )
+        counts = _numbers(dict(sorted(self.message_counts.items())))
         groups = (
-            (Opcode.SCHEMA, b"".join(map(record_bytes, self.schemas))),
-            (Opcode.CHANNEL, b"".join(map(record_bytes, self.channels))),
-            (Opcode.STATISTICS, record_bytes(statistics)),
+            (Opcode.SCHEMA, b"".join(map(_schema, self.schemas))),
+            (Opcode.CHANNEL, b"".join(map(_channel, self.channels))),
+            (Opcode.STATISTICS, _record(Opcode.STATISTICS, head, counts)),
             (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
-            (Opcode.ATTACHMENT_INDEX, b"".join(map(record_bytes, self._attachment_indexes))),
-            (Opcode.METADATA_INDEX, b"".join(map(record_bytes, self._metadata_indexes))),
+            (Opcode.ATTACHMENT_INDEX, b"".join(self._attachment_indexes)),
+            (Opcode.METADATA_INDEX, b"".join(self._metadata_indexes)),
         )
         summary = bytearray()
         offsets = bytearray()
         for opcode, group in groups:
             if group:
                 start = summary_start + len(summary)
-                offsets += record_bytes(SummaryOffset(opcode, start, len(group)))
+                place = _SUMMARY_OFFSET.pack(opcode, start, len(group))
+                offsets += _record(Opcode.SUMMARY_OFFSET, place)
                 summary += group
         offsets_start = summary_start + len(summary)
         summary += offsets
-        covered = _FOOTER_BEFORE_CRC.pack(
-            Opcode.FOOTER, _FOOTER_BYTES, summary_start, offsets_start
-        )
-        crc = zlib.crc32(covered, zlib.crc32(summary))
-        return bytes(summary) + record_bytes(Footer(summary_start, offsets_start, crc))
+        summary += RECORD_HEAD.pack(Opcode.FOOTER, _FOOTER_BYTES)
+        summary += _FOOTER.pack(summary_start, offsets_start)
+        return bytes(summary) + _U32.pack(zlib.crc32(summary))
 
 
 CHANNELS_MAX = 2**16 - 1
-_U64 = struct.Struct("<Q")
 _ZSTD_LEVEL = 1
 """Level 3 saves little space for ten times the time."""
 
@@ -196,7 +218,7 @@ class McapWriter:
         self._prepare(compression, progress)
         self._sink = Sink(path, force=force)
         try:
-            self._write(MAGIC + record_bytes(Header(profile, library)))
+            self._write(MAGIC + _record(Opcode.HEADER, _text(profile), _text(library)))
         except OutputError:
             self.abort()
             raise
@@ -248,7 +270,7 @@ class McapWriter:
         return self._summary.end_ns
 
     @property
-    def channels(self) -> list[tuple[Channel, str, int]]:
+    def channels(self) -> list[tuple[McapChannel, str, int]]:
         """Each channel with the name of its type and its number of messages."""
         counts = self._summary.message_counts
         names = {schema.id: schema.name for schema in self._summary.schemas}
@@ -267,26 +289,26 @@ class McapWriter:
         schema_id = self._schema_ids.get((type_name, schema_text))
         if schema_id is None:
             schema_id = len(self._schema_ids) + 1
-            schema = Schema(schema_id, schema_text.encode(), SCHEMA_ENCODING, type_name)
-            self._write(record_bytes(schema))
+            schema = McapSchema(schema_id, type_name, SCHEMA_ENCODING, schema_text)
+            self._write(_schema(schema))
             self._schema_ids[type_name, schema_text] = schema_id
             self._summary.schemas.append(schema)
-        channel = Channel(channel_id, topic, MESSAGE_ENCODING, dict(metadata), schema_id)
-        self._write(record_bytes(channel))
+        channel = McapChannel(channel_id, schema_id, topic, MESSAGE_ENCODING, dict(metadata))
+        self._write(_channel(channel))
         self._summary.channels.append(channel)
         return channel_id
 
     def metadata(self, name: str, mapping: Mapping[str, str]) -> None:
         """Write a metadata record."""
-        record = record_bytes(Metadata(name=name, metadata=dict(mapping)))
+        record = _record(Opcode.METADATA, _text(name), _texts(mapping))
         self._summary.add_metadata(name, offset=self._sink.offset, length=len(record))
         self._write(record)
 
     def attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Write an attachment. Its times are 0: dates would make files of equal runs differ."""
-        record = record_bytes(
-            Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
-        )
+        head = _ATTACHMENT_TIMES.pack(0, 0), _text(name), _text(media_type)
+        body = b"".join((*head, _U64.pack(len(data)), data))
+        record = _record(Opcode.ATTACHMENT, body, _U32.pack(zlib.crc32(body)))
         offset = self._sink.offset
         self._summary.add_attachment(
             name, media_type, size=len(data), offset=offset, length=len(record)
@@ -302,18 +324,10 @@ class McapWriter:
     ) -> tuple[int, int]:
         """Write a chunk whose data was made by ``packed``."""
         size = sum(map(len, data))
-        head = record_bytes(
-            Chunk(
-                compression=compression,
-                data=b"",
-                message_end_time=body.end_ns,
-                message_start_time=body.start_ns,
-                uncompressed_crc=crc,
-                uncompressed_size=body.size,
-            )
-        )
         # The data is not copied behind its head.
-        head = head[:1] + _U64.pack(len(head) - 9 + size) + head[9:-8] + _U64.pack(size)
+        head = _CHUNK_HEAD.pack(body.start_ns, body.end_ns, body.size, crc) + _text(compression)
+        head += _U64.pack(size)
+        head = RECORD_HEAD.pack(Opcode.CHUNK, len(head) + size) + head
         offset, length = self._sink.offset, len(head) + size
         indexes = b"".join(index for _, _, index in body.indexes)
         whole: int | None = None
@@ -369,7 +383,7 @@ class McapWriter:
 
         With ``replace``, it replaces the file that was there.
         """
-        self._write(record_bytes(DataEnd(self._sink.crc)))
+        self._write(_record(Opcode.DATA_END, _U32.pack(self._sink.crc)))
         self._write(self._summary.tail(self._sink.offset) + MAGIC)
         try:
             self._sink.finish(replace=replace)

@@ -10,7 +10,6 @@ import os
 import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.adapters.rclpy.actions.action_handle import ActionClientHandle, GoalHandle
@@ -49,6 +48,7 @@ from rsltrace.adapters.rclpy.names import (
 )
 from rsltrace.adapters.rclpy.node_clocks import NodeClocks
 from rsltrace.errors import UnsupportedError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.middleware.graph import names_and_types
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.simulation.middleware.qos.policies import Durability

@@ -13,7 +13,7 @@ import os
 import traceback
 from _thread import get_ident
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
@@ -24,6 +24,7 @@ from rsltrace.adapters.rclpy.concurrency.coroutines import Coroutines
 from rsltrace.adapters.rclpy.concurrency.mailbox import describe_service_call
 from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram, SimulatedPrograms
 from rsltrace.errors import EXIT_RUN
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.callers import is_user_or_library_file
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop

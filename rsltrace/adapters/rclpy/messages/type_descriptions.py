@@ -7,12 +7,12 @@ files, which are read here.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 from rsltrace.adapters.rclpy.messages.interface_classes import type_name
 from rsltrace.adapters.rclpy.messages.interfaces import installed_description, installed_file_text
+from rsltrace.fast_dataclass import dataclass
 
 
 @dataclass(frozen=True)

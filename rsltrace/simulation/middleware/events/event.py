@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any, NamedTuple, Protocol
 
 from rsltrace.compiled import EventFields
 from rsltrace.errors import RunError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.recorded_order import THE_RUN, entity_text
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder

@@ -12,10 +12,11 @@ and restoring an old method would remove later replacements.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import IntEnum
 from typing import Any
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import Entity
 
 

@@ -8,9 +8,10 @@ that a run without one can still end because nothing is left. The behaviour foll
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.middleware.qos.policies import INFINITE_NS, Liveliness, PolicyKind, Qos
 
