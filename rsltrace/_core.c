@@ -438,16 +438,7 @@ static int copy_packed(uint8_t *row, PyObject *packed, Py_ssize_t size) {
   return data == NULL ? -1 : 0;
 }
 
-static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, PyObject *kind) {
-  uint8_t row[CONTENT];
-  if (!(put(row, content_hash, U64, 8) && put(row + 8, entity, U32, 4) &&
-        put(row + CONTENT_KIND, kind, U32, 4))) {
-    PyObject *by = layout("OUTPUT_CONTENT"), *packed;
-    if (by == NULL) return -1;
-    packed = PyObject_CallMethod(by, "pack", "OOO", content_hash, entity, kind);
-    Py_DECREF(by);
-    if (copy_packed(row, packed, CONTENT) < 0) return -1;
-  }
+static int add_row(Chain *self, const uint8_t *row) {
   self->output_hash = content_hash64(row, self->output_hash);
   if (self->buffer != NULL) {
     if (append(&self->buffer->contents, row, CONTENT) < 0) return -1;
@@ -475,6 +466,19 @@ static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, Py
     Py_DECREF(observers);
   }
   return 0;
+}
+
+static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, PyObject *kind) {
+  uint8_t row[CONTENT];
+  if (!(put(row, content_hash, U64, 8) && put(row + 8, entity, U32, 4) &&
+        put(row + CONTENT_KIND, kind, U32, 4))) {
+    PyObject *by = layout("OUTPUT_CONTENT"), *packed;
+    if (by == NULL) return -1;
+    packed = PyObject_CallMethod(by, "pack", "OOO", content_hash, entity, kind);
+    Py_DECREF(by);
+    if (copy_packed(row, packed, CONTENT) < 0) return -1;
+  }
+  return add_row(self, row);
 }
 
 /* Adds an output and the sequence of its payload; returns its number in the event. */
@@ -749,10 +753,16 @@ static int record_end(Dispatcher *self, PyObject *recorder, Loop *loop, Event *e
   return done(result);
 }
 
-int record_draw(PyObject *recorder, PyObject *entity, PyObject *draw) {
-  PyObject *row[] = {entity, draw};
-  if (is_a(recorder, chain_type, &chain_seen)) return done(chain_draw((Chain *)recorder, row, 2));
-  return done(PyObject_CallMethod(recorder, "draw", "OO", entity, draw));
+int record_draw(PyObject *recorder, PyObject *entity, unsigned long long draw) {
+  const uint32_t kind = DRAW;
+  uint8_t row[CONTENT];
+  if (!is_a(recorder, chain_type, &chain_seen) || !put(row + 8, entity, U32, 4))
+    return done(PyObject_CallMethod(recorder, "draw", "OK", entity, draw));
+  memcpy(row, &draw, 8);
+  memcpy(row + CONTENT_KIND, &kind, 4);
+  if (add_row((Chain *)recorder, row) < 0) return -1;
+  ((Chain *)recorder)->outputs++;
+  return 0;
 }
 
 static int settle_entities(Dispatcher *self) {
@@ -911,24 +921,28 @@ static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
   return HAS_FIELDS(loop, Loop, loop) ? append_to(loop->ready, subscription) : -1;
 }
 
-static int deliver_to_all(Entity *self, PyObject *delivery, Loop *loop) {
-  PyObject *all = Py_NewRef(self->subscriptions);
-  int failed = PyList_Size(all) < 0;
+/* `message` is a delivery from the CDR on. */
+static int deliver_to_all(Entity *self, PyObject *const *message, PyObject *now_ns, Loop *loop) {
+  PyObject *all = Py_NewRef(self->subscriptions); /* packing may collect garbage: it may publish */
+  PyObject *delivery = PyTuple_Pack(10, now_ns, zero, zero, Py_None, message[0], message[1],
+                                    message[2], message[3], message[4], message[5]);
+  int failed = delivery == NULL || PyList_Size(all) < 0;
   for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
     PyObject *subscription = Py_NewRef(PyList_GetItem(all, i));
     failed = deliver(subscription, delivery, loop) < 0;
     Py_DECREF(subscription);
   }
+  Py_XDECREF(delivery);
   Py_DECREF(all);
   return failed;
 }
 
-static int send_over_links(Entity *self, PyObject *delivery) {
+static int send_over_links(Entity *self, PyObject *const *message) {
   PyObject *all = Py_NewRef(self->links);
   int failed = PyList_Size(all) < 0;
   for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
     PyObject *link = Py_NewRef(PyList_GetItem(all, i));
-    failed = send_over(link, delivery) < 0;
+    failed = send_over(link, message) < 0;
     Py_DECREF(link);
   }
   Py_DECREF(all);
@@ -956,25 +970,9 @@ static int record_message(Entity *self, PyObject *recorder, PyObject *now_ns, Py
   return *position == NULL ? -1 : 0;
 }
 
-static PyObject *delivery_of(Loop *loop, PyObject *now_ns, PyObject *data, PyObject *digest,
-                             PyObject *position, PyObject *count) {
-  PyObject *items[] = {now_ns,   zero,   zero,   Py_None, data, loop->events,
-                       position, digest, now_ns, count};
-  PyObject *delivery;
-  for (int i = 0; i < 10; ++i) Py_INCREF(items[i]);
-  delivery = PyTuple_New(10); /* a collection of garbage may publish, and replace fields */
-  for (int i = 0; i < 10; ++i) {
-    if (delivery == NULL)
-      Py_DECREF(items[i]);
-    else
-      PyTuple_SetItem(delivery, i, items[i]);
-  }
-  return delivery;
-}
-
 static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
                         PyObject *content_hash) {
-  PyObject *digest = NULL, *position = NULL, *delivery = NULL, *now_ns = NULL;
+  PyObject *digest = NULL, *position = NULL, *now_ns = NULL;
   PyObject *recorder = Py_NewRef(dispatcher->recorder);
   Loop *loop = (Loop *)Py_NewRef(dispatcher->loop);
   int failed = !HAS_FIELDS(loop, Loop, loop);
@@ -989,14 +987,15 @@ static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
   }
   failed = failed || !HAS_FIELDS(loop, Loop, loop) || !is_publisher((PyObject *)self);
   if (!failed) {
-    delivery = delivery_of(loop, now_ns, data, digest, position, self->count);
-    failed = delivery == NULL || set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 ||
-             !is_publisher((PyObject *)self) ||
-             (self->links == Py_None ? deliver_to_all(self, delivery, loop)
-                                     : send_over_links(self, delivery));
+    PyObject *events = Py_NewRef(loop->events), *number = Py_NewRef(self->count);
+    PyObject *message[] = {data, events, position, digest, now_ns, number};
+    failed = set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 || !is_publisher((PyObject *)self) ||
+             (self->links == Py_None ? deliver_to_all(self, message, now_ns, loop)
+                                     : send_over_links(self, message));
+    Py_DECREF(number);
+    Py_DECREF(events);
   }
   Py_XDECREF(now_ns);
-  Py_XDECREF(delivery);
   Py_XDECREF(position);
   Py_XDECREF(digest);
   Py_DECREF(loop);
