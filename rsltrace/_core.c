@@ -426,13 +426,7 @@ static int chain_init(Chain *self, PyObject *args, PyObject *named) {
   return 0;
 }
 
-static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, PyObject *kind) {
-  uint8_t row[CONTENT];
-  if (!(put(row, content_hash, U64, 8) && put(row + 8, entity, U32, 4) &&
-        put(row + CONTENT_KIND, kind, U32, 4)) &&
-      pack_by("rsltrace.trace.format", "OUTPUT_CONTENT", row, CONTENT,
-              Py_BuildValue("OOO", content_hash, entity, kind)) < 0)
-    return -1;
+static int add_row(Chain *self, const uint8_t *row) {
   self->output_hash = content_hash64(row, self->output_hash);
   if (self->buffer != NULL) {
     if (append(&self->buffer->contents, row, CONTENT) < 0) return -1;
@@ -452,6 +446,16 @@ static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, Py
     return failed;
   }
   return 0;
+}
+
+static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, PyObject *kind) {
+  uint8_t row[CONTENT];
+  if (!(put(row, content_hash, U64, 8) && put(row + 8, entity, U32, 4) &&
+        put(row + CONTENT_KIND, kind, U32, 4)) &&
+      pack_by("rsltrace.trace.format", "OUTPUT_CONTENT", row, CONTENT,
+              Py_BuildValue("OOO", content_hash, entity, kind)) < 0)
+    return -1;
+  return add_row(self, row);
 }
 
 /* Adds an output and the sequence of its payload; returns its number in the event. */
@@ -743,10 +747,16 @@ static int record_end(Dispatcher *self, PyObject *recorder, Loop *loop, Event *e
   return done(result);
 }
 
-int record_draw(PyObject *recorder, PyObject *entity, PyObject *draw) {
-  PyObject *row[] = {entity, draw};
-  if (is_a(recorder, chain_type, &chain_seen)) return done(chain_draw((Chain *)recorder, row, 2));
-  return done(PyObject_CallMethod(recorder, "draw", "OO", entity, draw));
+int record_draw(PyObject *recorder, PyObject *entity, unsigned long long draw) {
+  const uint32_t kind = DRAW;
+  uint8_t row[CONTENT];
+  if (!is_a(recorder, chain_type, &chain_seen) || !put(row + 8, entity, U32, 4))
+    return done(PyObject_CallMethod(recorder, "draw", "OK", entity, draw));
+  memcpy(row, &draw, 8);
+  memcpy(row + CONTENT_KIND, &kind, 4);
+  if (add_row((Chain *)recorder, row) < 0) return -1;
+  ((Chain *)recorder)->outputs++;
+  return 0;
 }
 
 static int settle_entities(Dispatcher *self) {
@@ -905,24 +915,28 @@ static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
   return HAS_FIELDS(loop, Loop, loop) ? append_to(loop->ready, subscription) : -1;
 }
 
-static int deliver_to_all(Entity *self, PyObject *delivery, Loop *loop) {
-  PyObject *all = Py_NewRef(self->subscriptions);
-  int failed = PyList_Size(all) < 0;
+/* `message` is a delivery from the CDR on. */
+static int deliver_to_all(Entity *self, PyObject *const *message, PyObject *now_ns, Loop *loop) {
+  PyObject *all = Py_NewRef(self->subscriptions); /* packing may collect garbage: it may publish */
+  PyObject *delivery = PyTuple_Pack(10, now_ns, zero, zero, Py_None, message[0], message[1],
+                                    message[2], message[3], message[4], message[5]);
+  int failed = delivery == NULL || PyList_Size(all) < 0;
   for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
     PyObject *subscription = Py_NewRef(PyList_GetItem(all, i));
     failed = deliver(subscription, delivery, loop) < 0;
     Py_DECREF(subscription);
   }
+  Py_XDECREF(delivery);
   Py_DECREF(all);
   return failed;
 }
 
-static int send_over_links(Entity *self, PyObject *delivery) {
+static int send_over_links(Entity *self, PyObject *const *message) {
   PyObject *all = Py_NewRef(self->links);
   int failed = PyList_Size(all) < 0;
   for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
     PyObject *link = Py_NewRef(PyList_GetItem(all, i));
-    failed = send_over(link, delivery) < 0;
+    failed = send_over(link, message) < 0;
     Py_DECREF(link);
   }
   Py_DECREF(all);
@@ -950,20 +964,9 @@ static int record_message(Entity *self, PyObject *recorder, PyObject *now_ns, Py
   return *position == NULL ? -1 : 0;
 }
 
-static PyObject *delivery_of(Loop *loop, PyObject *now_ns, PyObject *data, PyObject *digest,
-                             PyObject *position, PyObject *number) {
-  /* A new tuple: a collection of garbage may publish, and replace fields. */
-  PyObject *event = Py_NewRef(loop->events), *count = Py_NewRef(number);
-  PyObject *delivery = PyTuple_Pack(10, now_ns, zero, zero, Py_None, data, event, position, digest,
-                                    now_ns, count);
-  Py_DECREF(count);
-  Py_DECREF(event);
-  return delivery;
-}
-
 static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
                         PyObject *content_hash) {
-  PyObject *digest = NULL, *position = NULL, *delivery = NULL, *now_ns = NULL;
+  PyObject *digest = NULL, *position = NULL, *now_ns = NULL;
   PyObject *recorder = Py_NewRef(dispatcher->recorder);
   Loop *loop = (Loop *)Py_NewRef(dispatcher->loop);
   int failed = !HAS_FIELDS(loop, Loop, loop);
@@ -978,14 +981,15 @@ static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
   }
   failed = failed || !HAS_FIELDS(loop, Loop, loop) || !is_publisher((PyObject *)self);
   if (!failed) {
-    delivery = delivery_of(loop, now_ns, data, digest, position, self->count);
-    failed = delivery == NULL || set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 ||
-             !is_publisher((PyObject *)self) ||
-             (self->links == Py_None ? deliver_to_all(self, delivery, loop)
-                                     : send_over_links(self, delivery));
+    PyObject *events = Py_NewRef(loop->events), *number = Py_NewRef(self->count);
+    PyObject *message[] = {data, events, position, digest, now_ns, number};
+    failed = set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 || !is_publisher((PyObject *)self) ||
+             (self->links == Py_None ? deliver_to_all(self, message, now_ns, loop)
+                                     : send_over_links(self, message));
+    Py_DECREF(number);
+    Py_DECREF(events);
   }
   Py_XDECREF(now_ns);
-  Py_XDECREF(delivery);
   Py_XDECREF(position);
   Py_XDECREF(digest);
   Py_DECREF(loop);
@@ -1225,7 +1229,7 @@ static int find_first(TimerQueue *queue, PyObject *heap) {
 }
 
 static PyObject *timer_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
-  PyObject *entry = PyTuple_New(3); /* first, as it may collect garbage: see delivery_of */
+  PyObject *entry = PyTuple_New(3); /* first, as it may collect garbage: see send_plainly */
   Dispatcher *dispatcher;
   Loop *loop;
   TimerQueue *queue;

@@ -134,13 +134,13 @@ int set(PyObject **field, PyObject *value);
 PyObject *attribute_of(const char *module_name, const char *name);
 int done(PyObject *result);
 int append_to(PyObject *queue, PyObject *item);
-int record_draw(PyObject *recorder, PyObject *entity, PyObject *draw);
+int record_draw(PyObject *recorder, PyObject *entity, unsigned long long draw);
 
 /* Puts an arrival into the queue of its receiver; returns whether that is ready for it now. */
 int queue_arrival(PyObject *receiver, PyObject *arrival);
 
-/* Sends a delivery over a link. */
-int send_over(PyObject *link, PyObject *delivery);
+/* Sends a message over a link: the parts of a delivery from the CDR on. */
+int send_over(PyObject *link, PyObject *const *message);
 
 int add_loop_types(PyObject *module);
 int add_message_plan(PyObject *module); /* of _cdr.c */

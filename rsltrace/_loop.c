@@ -13,8 +13,8 @@ typedef struct {
 PyTypeObject *loop_type;
 static PyTypeObject *link_type;
 static PyObject *link_seen;
-static PyObject *heappush, *heappop, *first_draw, *order_release, *minus_one;
-static PyObject *next_ns_name, *destroyed_name, *popleft_name, *send_name;
+static PyObject *heappush, *heappop, *order_release, *minus_one;
+static PyObject *next_ns_name, *popleft_name, *send_name;
 
 FIELDS(WholeLoop, loop)
 FIELDS(Link, link)
@@ -62,44 +62,54 @@ static int is_method(PyObject *method, PyObject *link, PyCFunction function) {
 
 /* Returns the receiver if it is ready now, else None. */
 static PyObject *link_arrive(Link *self, PyObject *release) {
-  PyObject *subscription, *destroyed, *receiver = NULL;
-  int is_it;
+  PyObject *to, *receiver = NULL;
+  int is_it = 0;
   if (!is_plain((PyObject *)self)) return NULL;
-  subscription = Py_NewRef(self->subscription);
-  destroyed = PyObject_GetAttr(subscription, destroyed_name);
-  is_it = destroyed == NULL ? -1 : PyObject_IsTrue(destroyed);
-  Py_XDECREF(destroyed);
-  if (is_it > 0) {
-    receiver = Py_NewRef(Py_None);
-  } else if (is_it == 0) {
-    is_it = queue_arrival(subscription, release);
-    if (is_it >= 0) receiver = Py_NewRef(is_it ? subscription : Py_None);
-  }
-  Py_DECREF(subscription);
+  to = Py_NewRef(self->subscription);
+  if (!is_a(to, entity_type, &subscription_seen) || ((Entity *)to)->destroyed != Py_True)
+    is_it = queue_arrival(to, release);
+  if (is_it >= 0) receiver = Py_NewRef(is_it ? to : Py_None);
+  Py_DECREF(to);
   return receiver;
 }
 
-static PyObject *when_it_leaves(Link *self, WholeLoop *loop) {
-  Dispatcher *dispatcher = (Dispatcher *)self->dispatcher;
-  Event *event;
-  int is_busy;
-  if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) return NULL;
-  event = (Event *)dispatcher->event;
-  if (!HAS_FIELDS(event, Event, event)) return NULL;
-  PyObject *busy_ns = Py_NewRef(event->busy_ns), *now_ns = Py_NewRef(loop->of_events.now_ns), *sum;
-  is_busy = PyObject_IsTrue(busy_ns);
-  sum = is_busy < 0 ? NULL : is_busy ? PyNumber_Add(now_ns, busy_ns) : Py_NewRef(now_ns);
-  Py_DECREF(now_ns);
-  Py_DECREF(busy_ns);
-  return sum;
+/* What sending reads, held, as any code of Python may replace it. */
+enum { LOOP, ENTITY_ID, RECORDER, SAMPLER, ARRIVE, NOW_NS, BUSY_NS, NEXT_PLACE, HEAP, HELD };
+
+static int hold(Link *self, PyObject **held) {
+  if (!is_plain((PyObject *)self) || !is_loop(self->loop) ||
+      !HAS_FIELDS(self->dispatcher, Dispatcher, dispatcher))
+    return -1;
+  const WholeLoop *loop = (WholeLoop *)self->loop;
+  const Dispatcher *dispatcher = (Dispatcher *)self->dispatcher;
+  const Event *event = (Event *)dispatcher->event;
+  const Entity *to = (Entity *)self->subscription;
+  if (!HAS_FIELDS(event, Event, event)) return -1;
+  if (!is_a(self->subscription, entity_type, &subscription_seen) || to->entity_id == NULL) {
+    PyErr_SetString(PyExc_TypeError, "a subscription has no id");
+    return -1;
+  }
+  PyObject *all[HELD] = {
+      [LOOP] = self->loop,
+      [ENTITY_ID] = to->entity_id,
+      [RECORDER] = dispatcher->recorder,
+      [SAMPLER] = self->delay,
+      [ARRIVE] = self->arrive,
+      [NOW_NS] = loop->of_events.now_ns,
+      [BUSY_NS] = event->busy_ns,
+      [NEXT_PLACE] = loop->next_place,
+      [HEAP] = loop->scheduled,
+  };
+  for (int i = 0; i < HELD; ++i) held[i] = Py_NewRef(all[i]);
+  return 0;
 }
 
 /* Draws a delay; sets it and the time of the arrival, which is not before the last one. */
-static int draw_delay(Link *self, PyObject *leaves_ns, PyObject **delay_ns, PyObject **arrival_ns) {
-  PyObject *sampler = Py_NewRef(self->delay), *last_ns;
+static int draw_delay(Link *self, PyObject *sampler, PyObject *leaves_ns, PyObject **delay_ns,
+                      PyObject **arrival_ns) {
+  PyObject *last_ns;
   int is_early;
   *delay_ns = PyObject_CallFunctionObjArgs(sampler, leaves_ns, NULL);
-  Py_DECREF(sampler);
   if (*delay_ns == NULL || !is_plain((PyObject *)self)) return -1;
   last_ns = Py_NewRef(self->last_ns);
   *arrival_ns = PyNumber_Add(leaves_ns, *delay_ns);
@@ -111,100 +121,71 @@ static int draw_delay(Link *self, PyObject *leaves_ns, PyObject **delay_ns, PyOb
   return is_early < 0 ? -1 : set(&self->last_ns, Py_NewRef(*arrival_ns));
 }
 
-static int record_delay(Link *self, PyObject *delay_ns) {
-  Dispatcher *dispatcher = (Dispatcher *)self->dispatcher;
-  Entity *to = (Entity *)self->subscription;
-  PyObject *recorder, *entity, *draw;
-  int failed;
-  if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) return -1;
-  if (dispatcher->recorder == Py_None) return 0;
-  if (!is_a((PyObject *)to, entity_type, &subscription_seen) || to->entity_id == NULL) {
-    PyErr_SetString(PyExc_TypeError, "a subscription has no id");
-    return -1;
-  }
-  recorder = Py_NewRef(dispatcher->recorder);
-  entity = Py_NewRef(to->entity_id);
-  draw = PyNumber_Or(first_draw, delay_ns);
-  failed = draw == NULL || record_draw(recorder, entity, draw) < 0;
-  Py_XDECREF(draw);
-  Py_DECREF(entity);
-  Py_DECREF(recorder);
-  return failed ? -1 : 0;
+static int record_delay(PyObject *recorder, PyObject *entity, PyObject *delay_ns) {
+  unsigned long long number;
+  if (recorder == Py_None) return 0;
+  number = PyLong_AsUnsignedLongLong(delay_ns);
+  if (number == (unsigned long long)-1 && PyErr_Occurred()) return -1;
+  return record_draw(recorder, entity, DELAY | number);
 }
 
-static PyObject *release_of(Link *self, WholeLoop *loop, PyObject *arrival_ns,
+static PyObject *release_of(PyObject *const *held, PyObject *arrival_ns,
                             PyObject *const *message) {
-  PyObject *next_place = Py_NewRef(loop->next_place), *arrive = NULL, *release = NULL;
-  PyObject *place = PyObject_CallObject(next_place, NULL);
-  Py_DECREF(next_place);
-  if (place != NULL && is_plain((PyObject *)self)) arrive = Py_NewRef(self->arrive);
-  if (arrive != NULL) release = PyTuple_New(10); /* may collect garbage: see delivery_of */
-  if (release != NULL) {
-    PyTuple_SetItem(release, 0, Py_NewRef(arrival_ns));
-    PyTuple_SetItem(release, 1, Py_NewRef(order_release));
-    PyTuple_SetItem(release, 2, Py_NewRef(place));
-    PyTuple_SetItem(release, 3, Py_NewRef(arrive));
-    for (int i = 0; i < 6; ++i) PyTuple_SetItem(release, 4 + i, Py_NewRef(message[i]));
-  }
-  Py_XDECREF(arrive);
-  Py_XDECREF(place);
+  PyObject *place = PyObject_CallObject(held[NEXT_PLACE], NULL), *release;
+  if (place == NULL) return NULL;
+  release = PyTuple_Pack(10, arrival_ns, order_release, place, held[ARRIVE], message[0],
+                         message[1], message[2], message[3], message[4], message[5]);
+  Py_DECREF(place);
   return release;
 }
 
 /* Whether a message has to wait in the loop's queue. */
-static int is_later(Link *self, WholeLoop *loop, PyObject *delay_ns, PyObject *arrival_ns) {
-  PyObject *arrive, *expects, *now_ns = Py_NewRef(loop->of_events.now_ns);
+static int is_later(Link *self, PyObject *const *held, PyObject *delay_ns, PyObject *arrival_ns) {
+  PyObject *expects, *now_ns;
   int is_it = PyObject_IsTrue(delay_ns);
-  if (is_it == 0) is_it = PyObject_RichCompareBool(arrival_ns, now_ns, Py_NE);
+  if (is_it) return is_it;
+  if (!is_loop(held[LOOP])) return -1;
+  now_ns = Py_NewRef(((Loop *)held[LOOP])->now_ns);
+  is_it = PyObject_RichCompareBool(arrival_ns, now_ns, Py_NE);
   Py_DECREF(now_ns);
-  if (is_it || !is_plain((PyObject *)self)) return is_it ? is_it : -1;
-  arrive = Py_NewRef(self->arrive);
-  expects = PyObject_CallMethod((PyObject *)self, "expects", "O", arrive);
-  Py_DECREF(arrive);
+  if (is_it) return is_it;
+  expects = PyObject_CallMethod((PyObject *)self, "expects", "O", held[ARRIVE]);
   is_it = expects == NULL ? -1 : PyObject_IsTrue(expects);
   Py_XDECREF(expects);
   return is_it;
 }
 
-static int enter(Link *self, WholeLoop *loop, PyObject *release, PyObject *delay_ns,
+static int enter(Link *self, PyObject *const *held, PyObject *release, PyObject *delay_ns,
                  PyObject *arrival_ns) {
-  PyObject *heap, *receiver;
-  const int later = is_later(self, loop, delay_ns, arrival_ns);
+  PyObject *receiver;
+  const int later = is_later(self, held, delay_ns, arrival_ns);
   int failed;
-  if (later < 0 || !is_loop((PyObject *)loop)) return -1;
-  if (later) {
-    heap = Py_NewRef(loop->scheduled);
-    failed = done(PyObject_CallFunctionObjArgs(heappush, heap, release, NULL));
-    Py_DECREF(heap);
-    return failed;
-  }
+  if (later)
+    return later < 0 ? -1 : done(PyObject_CallFunctionObjArgs(heappush, held[HEAP], release, NULL));
   receiver = link_arrive(self, release);
   if (receiver == NULL) return -1;
-  failed = receiver != Py_None && (!is_loop((PyObject *)loop) ||
-                                   append_to(loop->of_events.ready, receiver) < 0);
+  failed = receiver != Py_None &&
+           (!is_loop(held[LOOP]) || append_to(((Loop *)held[LOOP])->ready, receiver) < 0);
   Py_DECREF(receiver);
   return failed ? -1 : 0;
 }
 
 static int send_plainly(Link *self, PyObject *const *message) {
-  PyObject *leaves_ns, *delay_ns = NULL, *arrival_ns = NULL, *release = NULL;
-  WholeLoop *loop;
-  int failed;
-  if (!is_plain((PyObject *)self) || !is_loop(self->loop)) return -1;
-  loop = (WholeLoop *)Py_NewRef(self->loop);
-  leaves_ns = when_it_leaves(self, loop);
-  failed = leaves_ns == NULL || !is_plain((PyObject *)self) ||
-           draw_delay(self, leaves_ns, &delay_ns, &arrival_ns) < 0 ||
-           !is_plain((PyObject *)self) || record_delay(self, delay_ns) < 0 ||
-           !is_loop((PyObject *)loop);
-  if (!failed) release = release_of(self, loop, arrival_ns, message);
-  failed = release == NULL || !is_loop((PyObject *)loop) ||
-           enter(self, loop, release, delay_ns, arrival_ns) < 0;
+  PyObject *held[HELD], *leaves_ns, *delay_ns = NULL, *arrival_ns = NULL, *release = NULL;
+  int failed, is_busy;
+  if (hold(self, held) < 0) return -1;
+  is_busy = PyObject_IsTrue(held[BUSY_NS]);
+  leaves_ns = is_busy ? PyNumber_Add(held[NOW_NS], held[BUSY_NS]) : Py_NewRef(held[NOW_NS]);
+  failed = leaves_ns == NULL ||
+           draw_delay(self, held[SAMPLER], leaves_ns, &delay_ns, &arrival_ns) < 0 ||
+           record_delay(held[RECORDER], held[ENTITY_ID], delay_ns) < 0;
+  if (!failed) release = release_of(held, arrival_ns, message);
+  failed = release == NULL || enter(self, held, release, delay_ns, arrival_ns) < 0;
   Py_XDECREF(release);
   Py_XDECREF(arrival_ns);
   Py_XDECREF(delay_ns);
   Py_XDECREF(leaves_ns);
-  Py_DECREF(loop);
+  for (int i = 0; i < HELD; ++i) Py_DECREF(held[i]);
   return failed ? -1 : 0;
 }
 
@@ -218,10 +199,9 @@ static PyObject *link_send(Link *self, PyObject *const *args, Py_ssize_t count) 
 
 #define LINK_SEND ((PyCFunction)(void (*)(void))link_send)
 
-int send_over(PyObject *link, PyObject *delivery) {
-  PyObject *message[6], *send;
+int send_over(PyObject *link, PyObject *const *message) {
+  PyObject *send;
   int result;
-  for (int i = 0; i < 6; ++i) message[i] = PyTuple_GetItem(delivery, 4 + i);
   if (is_a(link, link_type, &link_seen)) {
     send = ((Link *)link)->send;
     if (send != NULL && is_method(send, link, LINK_SEND)) return send_plainly((Link *)link, message);
@@ -282,25 +262,16 @@ static __int128 next_timer_ns(WholeLoop *self) {
   return next_ns;
 }
 
-/* Whether the next arrival is all that the loop has to look at; -1 with an error. */
+/* Whether the next arrival is all that the loop has to look at; not so, possibly, with an error. */
 static int is_next(WholeLoop *self) {
   PyObject *time = first_ns(self);
-  __int128 next_ns, timer_ns;
-  Py_ssize_t others;
-  if (time == NULL) return PyErr_Occurred() ? -1 : 0;
-  next_ns = number_of(time);
-  if (next_ns == -1 && PyErr_Occurred()) return -1;
-  others = size_of(self->of_events.ready);
-  if (others == 0) others = size_of(self->tasks);
-  if (others == 0) others = size_of(self->idle);
-  if (others) return others < 0 ? -1 : 0;
-  if (self->gate != Py_None) return 0;
-  if (next_ns <= number_of(self->of_events.now_ns) || next_ns >= number_of(self->quiet_ns) ||
-      number_of(self->of_events.events) >= number_of(self->until_events) ||
-      number_of(self->min_step_ns) != 0 || PyErr_Occurred() || !is_loop((PyObject *)self))
-    return PyErr_Occurred() ? -1 : 0;
-  timer_ns = next_timer_ns(self);
-  return PyErr_Occurred() ? -1 : next_ns < timer_ns;
+  const __int128 next_ns = time == NULL ? -1 : number_of(time);
+  return next_ns >= 0 && size_of(self->of_events.ready) == 0 && size_of(self->tasks) == 0 &&
+         size_of(self->idle) == 0 && self->gate == Py_None &&
+         next_ns > number_of(self->of_events.now_ns) && next_ns < number_of(self->quiet_ns) &&
+         number_of(self->of_events.events) < number_of(self->until_events) &&
+         number_of(self->min_step_ns) == 0 && is_loop((PyObject *)self) &&
+         next_ns < next_timer_ns(self);
 }
 
 static PyObject *receiver_of(PyObject *release) {
@@ -333,9 +304,9 @@ static PyObject *first_ready(WholeLoop *self, PyObject *receiver) {
 
 static PyObject *loop_next_arrival(WholeLoop *self, PyObject *Py_UNUSED(none)) {
   PyObject *heap, *release, *receiver, *first = NULL;
-  const int is_it = is_loop((PyObject *)self) ? is_next(self) : -1;
-  if (is_it <= 0) return is_it < 0 ? NULL : Py_NewRef(Py_False);
-  if (!is_loop((PyObject *)self)) return NULL;
+  const int is_it = is_loop((PyObject *)self) && is_next(self);
+  if (PyErr_Occurred() || !is_loop((PyObject *)self)) return NULL;
+  if (!is_it) return Py_NewRef(Py_False);
   heap = Py_NewRef(self->scheduled);
   release = PyObject_CallFunctionObjArgs(heappop, heap, NULL);
   Py_DECREF(heap);
@@ -361,17 +332,15 @@ int add_loop_types(PyObject *module) {
   heappush = attribute_of("heapq", "heappush");
   heappop = attribute_of("heapq", "heappop");
   order_release = PyLong_FromLong(1);
-  first_draw = PyLong_FromLongLong(DELAY);
   minus_one = PyLong_FromLong(-1);
   next_ns_name = PyUnicode_InternFromString("next_ns");
-  destroyed_name = PyUnicode_InternFromString("destroyed");
   popleft_name = PyUnicode_InternFromString("popleft");
   send_name = PyUnicode_InternFromString("send");
   loop_type = loop_made(loop_fields, loop_methods);
   link_type = link_made(link_fields, link_methods);
-  if (heappush == NULL || heappop == NULL || first_draw == NULL || order_release == NULL ||
-      minus_one == NULL || next_ns_name == NULL || destroyed_name == NULL || popleft_name == NULL ||
-      send_name == NULL || loop_type == NULL || link_type == NULL ||
+  if (heappush == NULL || heappop == NULL || order_release == NULL || minus_one == NULL ||
+      next_ns_name == NULL || popleft_name == NULL || send_name == NULL ||
+      loop_type == NULL || link_type == NULL ||
       PyModule_AddObjectRef(module, "LoopFields", (PyObject *)loop_type) < 0)
     return -1;
   return PyModule_AddObjectRef(module, "LinkFields", (PyObject *)link_type);
