@@ -5,8 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_sensor_data,
+)
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, String, UInt64
@@ -203,6 +211,22 @@ def test_incompatible_qos_does_not_connect_and_is_reported(simulate: Any) -> Non
     assert seen == []
     texts = trace.logs()
     assert any("incompatible QoS" in text and "RELIABILITY" in text for text in texts)
+
+
+def test_an_incompatible_policy_has_the_name_that_rclpy_gives_it(simulate: Any) -> None:
+    seen: list[Any] = []
+
+    def node() -> Node:
+        node = Node("mismatch")
+        note = PublisherEventCallbacks(incompatible_qos=lambda e: seen.append(e.last_policy_kind))
+        node.create_publisher(UInt64, "n", qos_profile_sensor_data, event_callbacks=note)
+        node.create_subscription(UInt64, "n", print, 10)
+        return node
+
+    simulate(node, duration=1)
+    (policy,) = seen
+    assert (policy.name, policy.value) == ("RMW_QOS_POLICY_RELIABILITY", 16)
+    assert QoSPolicyKind(policy) is QoSPolicyKind.RELIABILITY
 
 
 def test_two_types_on_one_topic_name_both_ends(simulate: Any) -> None:

@@ -137,6 +137,7 @@ class RclpyBoundary:
     QoSCompatibility: Any
     InvalidHandle: type[Exception]
     SignalHandlerOptions: Any
+    rmw_qos_policy_kind_t: Any
     rmw_qos_profile_t: Any
 
     def __init__(self, real: Any | None) -> None:
@@ -295,7 +296,7 @@ class RclpyBoundary:
         return GuardConditionHandle(context.runtime)
 
     def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
-        return EventHandle(parent, event_type)
+        return EventHandle(parent, event_type, self.rmw_qos_policy_kind_t)
 
     QoSEvent = EventHandle  # its name up to Humble
 
