@@ -15,7 +15,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
     qos_profile_sensor_data,
 )
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, String, UInt64
 
@@ -227,6 +227,29 @@ def test_an_incompatible_policy_has_the_name_that_rclpy_gives_it(simulate: Any) 
     (policy,) = seen
     assert (policy.name, policy.value) == ("RMW_QOS_POLICY_RELIABILITY", 16)
     assert QoSPolicyKind(policy) is QoSPolicyKind.RELIABILITY
+
+
+@pytest.mark.parametrize(
+    ("data", "error"),
+    [(b"", "RMWError"), (b"\0\1\0\0\x05", "RMWError"), (bytearray(9), "TypeError")],
+)
+def test_what_is_no_serialized_message_fails_as_in_rclpy(
+    simulate: Any, data: Any, error: str
+) -> None:
+    seen: list[str] = []
+
+    def node() -> Node:
+        try:
+            deserialize_message(data, String)
+        except Exception as raised:
+            seen.append(type(raised).__name__)
+        return Node("reader")
+
+    simulate(node, duration=0.1)
+    assert seen == [error]
+    with pytest.raises(Exception) as native:
+        deserialize_message(data, String)
+    assert native.type.__name__ == error
 
 
 def test_two_types_on_one_topic_name_both_ends(simulate: Any) -> None:

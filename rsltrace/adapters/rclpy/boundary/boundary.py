@@ -133,6 +133,7 @@ class RclpyBoundary:
 
     RCLError: type[Exception]
     RCLInvalidROSArgsError: type[Exception]
+    RMWError: type[Exception]
     UnknownROSArgsError: type[Exception]
     QoSCompatibility: Any
     InvalidHandle: type[Exception]
@@ -415,7 +416,12 @@ class RclpyBoundary:
         return codec_for(message_type).serialize(message)
 
     def rclpy_deserialize(self, data: bytes, message_type: Any) -> Any:
-        return codec_for(message_type).deserialize(bytes(data))
+        if not isinstance(data, bytes):
+            raise TypeError(f"a serialized message is bytes, not {type(data).__name__}")
+        try:
+            return codec_for(message_type).deserialize(data)
+        except ValueError as error:
+            raise self.RMWError(f"failed to deserialize ROS message: {error}") from None
 
     def rclpy_assert_liveliness(self, publisher: Any) -> None:
         publisher.assert_liveliness()
