@@ -15,8 +15,8 @@ import ctypes
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import update_wrapper, wraps
-from types import BuiltinFunctionType, FunctionType, MethodType
+from functools import partial, update_wrapper, wraps
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 from rsltrace.errors import SetupError
@@ -178,6 +178,14 @@ def replace_attribute(stack: ExitStack, owner: Any, name: str, value: object) ->
     """Set an attribute of a module or class until ``stack`` ends."""
     stack.callback(setattr, owner, name, getattr(owner, name))
     setattr(owner, name, value)
+
+
+def module_with(module: ModuleType, **attributes: object) -> ModuleType:
+    """Return a module that differs from ``module`` in these attributes only: what stands in for
+    one that rclpy imports is the user's, too, after ``from rclpy.executors import *``."""
+    changed = ModuleType(module.__name__)
+    vars(changed).update(attributes, __getattr__=partial(getattr, module))
+    return changed
 
 
 def redirect_function(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 from unittest import mock
@@ -43,6 +43,28 @@ def no_real_sleep() -> Iterator[None]:
         simulated_waiting, "_real_sleep", side_effect=AssertionError("a real sleep")
     ):
         yield
+
+
+def test_modules_that_come_with_a_star_import_of_rclpy_are_whole(
+    simulate: Callable[..., Any],
+) -> None:
+    """``from rclpy.executors import *`` also brings rclpy's ``os`` and ``time``."""
+    log: list[Any] = []
+
+    def node() -> Node:
+        names: dict[str, Any] = {}
+        exec("from rclpy.node import *; from rclpy.executors import *", names)
+        exec("from rclpy.client import *; from rclpy.timer import *", names)
+        node = Node("star")
+        names["time"].sleep(0.25)
+        names["threading"].Thread(
+            target=lambda: log.append(names["os"].path.join("a", "b"))
+        ).start()
+        log.append((seconds(node), names["time"].monotonic()))
+        return node
+
+    simulate(node, duration=1)
+    assert log == ["a/b", (0.25, 0.25)]
 
 
 @pytest.mark.long

@@ -5,9 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_sensor_data,
+)
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, String, UInt64
 
@@ -203,6 +211,45 @@ def test_incompatible_qos_does_not_connect_and_is_reported(simulate: Any) -> Non
     assert seen == []
     texts = trace.logs()
     assert any("incompatible QoS" in text and "RELIABILITY" in text for text in texts)
+
+
+def test_an_incompatible_policy_has_the_name_that_rclpy_gives_it(simulate: Any) -> None:
+    seen: list[Any] = []
+
+    def node() -> Node:
+        node = Node("mismatch")
+        note = PublisherEventCallbacks(incompatible_qos=lambda e: seen.append(e.last_policy_kind))
+        node.create_publisher(UInt64, "n", qos_profile_sensor_data, event_callbacks=note)
+        node.create_subscription(UInt64, "n", print, 10)
+        return node
+
+    simulate(node, duration=1)
+    (policy,) = seen
+    assert (policy.name, policy.value) == ("RMW_QOS_POLICY_RELIABILITY", 16)
+    assert QoSPolicyKind(policy) is QoSPolicyKind.RELIABILITY
+
+
+@pytest.mark.parametrize(
+    ("data", "error"),
+    [(b"", "RMWError"), (b"\0\1\0\0\x05", "RMWError"), (bytearray(9), "TypeError")],
+)
+def test_what_is_no_serialized_message_fails_as_in_rclpy(
+    simulate: Any, data: Any, error: str
+) -> None:
+    seen: list[str] = []
+
+    def node() -> Node:
+        try:
+            deserialize_message(data, String)
+        except Exception as raised:
+            seen.append(type(raised).__name__)
+        return Node("reader")
+
+    simulate(node, duration=0.1)
+    assert seen == [error]
+    with pytest.raises(Exception) as native:
+        deserialize_message(data, String)
+    assert native.type.__name__ == error
 
 
 def test_two_types_on_one_topic_name_both_ends(simulate: Any) -> None:

@@ -202,6 +202,20 @@ def test_what_the_other_node_read_is_the_likely_cause(
     assert "/source read OFFERED" in rsltrace.diff(a, b).sentence
 
 
+def test_what_an_event_of_one_run_read_itself_is_not_why_it_happened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = JOB.replace("guard: {environment: allow}\n", "")
+    a = recorded(tmp_path, "a.mcap", monkeypatch, job)
+    b = recorded(
+        tmp_path, "b.mcap", monkeypatch, job.replace("  - node: changed_nodes:Source\n", "")
+    )
+    for diff in rsltrace.diff(a, b), rsltrace.diff(b, a):
+        assert "/source is constructed in" in diff.sentence
+        assert "likely cause" not in diff.sentence
+        assert diff.divergences[0].calls, "which still shows them"
+
+
 def test_periods_that_differ_are_shown_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     a = recorded(tmp_path, "a.mcap", monkeypatch)
     b = recorded(tmp_path, "b.mcap", monkeypatch, PERIOD="0.1000001")

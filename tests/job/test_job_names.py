@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -89,6 +90,21 @@ def test_right_sides_of_remappings(name: str, good: bool) -> None:
 def test_other_names(check: Callable[[str], None], good: list[str], bad: list[str]) -> None:
     assert [text for text in good if not accepts(check, text)] == []
     assert [text for text in bad if accepts(check, text)] == []
+
+
+@pytest.mark.parametrize(
+    ("target", "advice"),
+    [
+        ("nodes/ekf.py", "a module is named with dots: nodes.ekf:Class"),
+        ("/robot/ekf.py:Ekf", "add /robot to search_path and write ekf:Ekf"),
+        ("my-robot/ekf.py:Ekf", "add my-robot to search_path and write ekf:Ekf"),
+        ("nodes/my-ekf.py:Ekf", "'my-ekf' cannot be a module's name: rename the file"),
+        ("my-ekf:Ekf", "'my-ekf' cannot be a module's name: rename the file"),
+    ],
+)
+def test_the_advice_on_a_target_is_one_that_can_be_followed(target: str, advice: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(advice)):
+        check_target(target)
 
 
 @pytest.mark.ros

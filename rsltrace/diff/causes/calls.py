@@ -52,12 +52,13 @@ def call_differences(
     """Return the calls made inside two events, those with different answers first.
 
     If all answers agree, the first calls before them in the same node, or when its modules were
-    imported, that gave different ones come first: what was read earlier may show only now. ``node``
-    is another node that can be the cause.
+    imported, that gave different ones come first: what was read earlier may show only now. So it is
+    with the calls of an event that only one run has: they cannot be why it happened. ``node`` is
+    another node that can be the cause.
     """
     inside = _paired(_inside(run_a, a), _inside(run_b, b))
     differing = [call for call in inside if call.differs]
-    if differing:
+    if differing and a is not None and b is not None:
         return (*differing, *(call for call in inside if not call.differs))[:CALLS_MAX]
     some = a or b
     is_somebodys = some is not None and (node or subject_of(some))

@@ -73,10 +73,13 @@ def likely_cause(
         return None
     if (suppressed := suppressed_exception(judgement, runs)) is not None:
         return suppressed
-    if calls and calls[0].differs:
+    may_cause = calls
+    if judgement.a is None or judgement.b is None:  # what it called itself came after its start
+        may_cause = [c for c in calls if view.index not in (c.event_a, c.event_b)]
+    if may_cause and may_cause[0].differs:
         changed = judgement.changed
         subject = subject_of(view) if changed is None else changed.node
-        return ExternalAnswers(subject, telling_calls(calls, judgement.messages))
+        return ExternalAnswers(subject, telling_calls(may_cause, judgement.messages))
     if (found := _set_behind(run, view, judgement.messages, calls, relevance)) is not None:
         return found
     if (properties := changed_properties(judgement, runs)) is not None:

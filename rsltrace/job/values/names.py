@@ -105,11 +105,14 @@ def dotted_target(target: str) -> str:
 def _as_target(text: str) -> str:
     """Say how to write what was probably meant: a dotted name, or the path of a module."""
     path, _, attribute = text.partition(":")
+    folder, _, file = path.removesuffix(".py").rpartition("/")
+    module = f"{folder}/{file}".replace("/", ".").strip(".")
+    if path and (attribute or path.endswith(".py")) and not _MODULE_NAME.fullmatch(file):
+        return f"; {file!r} cannot be a module's name: rename the file, or run it with script:"
     if path.endswith(".py"):
-        folder, _, file = path.removesuffix(".py").rpartition("/")
-        if path.startswith(("/", "../")) and attribute:
+        below = not path.startswith(("/", "../")) and _MODULE_NAME.fullmatch(module)
+        if attribute and not below:
             return f"; add {folder or '/'} to search_path and write {file}:{attribute}"
-        module = path.removesuffix(".py").replace("/", ".").strip(".")
         return f"; a module is named with dots: {module}:{attribute or 'Class'}"
     module, dot, last = text.rpartition(".")
     return f"; write {module}:{last}" if dot and re.fullmatch(_TARGET, f"{module}:{last}") else ""

@@ -133,10 +133,12 @@ class RclpyBoundary:
 
     RCLError: type[Exception]
     RCLInvalidROSArgsError: type[Exception]
+    RMWError: type[Exception]
     UnknownROSArgsError: type[Exception]
     QoSCompatibility: Any
     InvalidHandle: type[Exception]
     SignalHandlerOptions: Any
+    rmw_qos_policy_kind_t: Any
     rmw_qos_profile_t: Any
 
     def __init__(self, real: Any | None) -> None:
@@ -295,7 +297,7 @@ class RclpyBoundary:
         return GuardConditionHandle(context.runtime)
 
     def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
-        return EventHandle(parent, event_type)
+        return EventHandle(parent, event_type, self.rmw_qos_policy_kind_t)
 
     QoSEvent = EventHandle  # its name up to Humble
 
@@ -414,7 +416,12 @@ class RclpyBoundary:
         return codec_for(message_type).serialize(message)
 
     def rclpy_deserialize(self, data: bytes, message_type: Any) -> Any:
-        return codec_for(message_type).deserialize(bytes(data))
+        if not isinstance(data, bytes):
+            raise TypeError(f"a serialized message is bytes, not {type(data).__name__}")
+        try:
+            return codec_for(message_type).deserialize(data)
+        except ValueError as error:
+            raise self.RMWError(f"failed to deserialize ROS message: {error}") from None
 
     def rclpy_assert_liveliness(self, publisher: Any) -> None:
         publisher.assert_liveliness()

@@ -18,7 +18,7 @@ from asyncio.tasks import _enter_task, _leave_task
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from types import SimpleNamespace
+from types import ModuleType
 from typing import Any, NoReturn
 
 from greenlet import getcurrent, greenlet
@@ -28,7 +28,7 @@ from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Patience, R
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.libraries import present_import
 from rsltrace.guard.recorded.processes import sleep_for_process
-from rsltrace.guard.redirect import Redirected, copy_of, replace_attribute
+from rsltrace.guard.redirect import Redirected, copy_of, module_with, replace_attribute
 from rsltrace.simulation.middleware.events.event import CurrentEvent
 from rsltrace.trace.model.event import EventFlag, EventKind
 from rsltrace.trace.model.texts import waiting_ns
@@ -328,13 +328,14 @@ def simulated_waiting(runtime: Runtime, seed: int) -> Iterator[None]:
         return runtime.loop.now_ns / 1_000_000_000
 
     replaced = [
-        (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
-        (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
+        (rclpy.node, "time", module_with(time, time=now, monotonic=now, sleep=_sleep)),
+        (rclpy.client, "time", module_with(time, time=now, monotonic=now, sleep=_sleep)),
         (rclpy.client, "threading", _threading(runtime, "the response to a service call")),
         (rclpy.timer, "threading", _threading(runtime, _RATE)),
         (rclpy.action.client, "threading", _threading(runtime, "an answer of an action server")),
-        (rclpy.task, "threading", SimpleNamespace(Lock=threading.Lock)),  # never held while waiting
-        (rclpy.action.client, "uuid", SimpleNamespace(uuid4=_goal_ids(runtime.event, seed))),
+        # Its lock is never held while waiting.
+        (rclpy.task, "threading", module_with(threading, Lock=threading.Lock)),
+        (rclpy.action.client, "uuid", module_with(uuid, uuid4=_goal_ids(runtime.event, seed))),
     ]
     with ExitStack() as stack:
         for module, name, value in replaced:
@@ -361,7 +362,10 @@ def _goal_ids(event: CurrentEvent, seed: int) -> Callable[[], uuid.UUID]:
     return uuid4
 
 
-def _threading(runtime: Runtime, what: str) -> SimpleNamespace:
-    return SimpleNamespace(
-        Event=partial(SimEvent, runtime, what), Lock=threading.Lock, RLock=threading.RLock
+def _threading(runtime: Runtime, what: str) -> ModuleType:
+    return module_with(
+        threading,
+        Event=partial(SimEvent, runtime, what),
+        Lock=threading.Lock,
+        RLock=threading.RLock,
     )

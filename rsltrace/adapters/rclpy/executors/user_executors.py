@@ -6,14 +6,16 @@ The replaced methods are those that add nodes, wake and shut down, and ``wait_fo
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache
 from importlib import import_module
 from pathlib import PurePath
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 from rsltrace.adapters.rclpy.concurrency.blocking_calls import count_refused_wait
@@ -22,7 +24,7 @@ from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.concurrency.tasks import create_task
 from rsltrace.adapters.rclpy.executors.executor_driver import driver_of
 from rsltrace.adapters.rclpy.handles.wait_set import sync_woken
-from rsltrace.guard.redirect import replace_attribute
+from rsltrace.guard.redirect import module_with, replace_attribute
 from rsltrace.guard.virtual.processors import PROCESSORS
 from rsltrace.simulation.middleware.interface import imported_file
 from rsltrace.trace.model.finding import EXECUTOR, NEVER_CALLED
@@ -129,10 +131,10 @@ def own_executors(runtime: Runtime) -> Iterator[None]:
     made: list[weakref.ref[Executor]] = []
     real = {name: getattr(Executor, name) for name in _methods(runtime, {}, made)}
     modules = {
-        "os": SimpleNamespace(
-            sched_getaffinity=lambda pid: set(range(PROCESSORS)), cpu_count=lambda: PROCESSORS
+        "os": module_with(
+            os, sched_getaffinity=lambda pid: set(range(PROCESSORS)), cpu_count=lambda: PROCESSORS
         ),
-        "time": SimpleNamespace(monotonic=lambda: runtime.loop.now_ns / 1_000_000_000),
+        "time": module_with(time, monotonic=lambda: runtime.loop.now_ns / 1_000_000_000),
     }
     with ExitStack() as stack:
         stack.callback(_release, made)

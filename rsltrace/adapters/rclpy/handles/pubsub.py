@@ -32,6 +32,7 @@ from rsltrace.simulation.middleware.qos.timing import (
     LIVELINESS_LOST,
     MATCHED,
     MESSAGE_LOST,
+    IncompatibleQosStatus,
 )
 from rsltrace.simulation.middleware.subscription import (
     DATA,
@@ -281,14 +282,17 @@ def _event_name(event_type: Any) -> str:
 
 class EventHandle(QosEvent, EntityHandle):
     """Stands in for ``_rclpy.EventHandle``; its wrapper is rclpy's EventHandler waitable. Each
-    trigger calls the ``alarms``."""
+    trigger calls the ``alarms``. ``policies`` is the enumeration ``rmw_qos_policy_kind_t``."""
 
     lists = "waitables"
     alarms: tuple[Alarm, ...] = ()
 
-    def __init__(self, parent: PublisherHandle | SubscriptionHandle, event_type: Any) -> None:
+    def __init__(
+        self, parent: PublisherHandle | SubscriptionHandle, event_type: Any, policies: type
+    ) -> None:
         self.runtime = parent.runtime
         super().__init__(parent.dispatcher, parent.node)
+        self.policies = policies
         self.listen(parent, _event_name(event_type))
 
     def _listed_by(self, node: Any) -> Iterator[tuple[Any, Any]]:
@@ -297,6 +301,12 @@ class EventHandle(QosEvent, EntityHandle):
                 handle = getattr(waitable, name, None)
                 if handle is not None:
                     yield handle, waitable
+
+    def take_event(self) -> Any:
+        status = super().take_event()
+        if isinstance(status, IncompatibleQosStatus):
+            status.last_policy_kind = self.policies(status.last_policy_kind)
+        return status
 
     def activate(self) -> None:
         self.trigger()

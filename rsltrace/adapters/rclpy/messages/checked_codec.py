@@ -305,7 +305,7 @@ class _Encoder:
         try:
             return str.encode(value)  # not value.encode, which a subclass may have replaced
         except UnicodeEncodeError as error:
-            raise self.wrong_value(path, f"cannot be encoded: {error}") from error
+            raise self.with_place(error, path) from None
 
     def text(self, type_: StringType, value: Any, path: str) -> None:
         if not isinstance(value, str):
@@ -314,7 +314,7 @@ class _Encoder:
             try:
                 wide = pack_wide(value)
             except UnicodeEncodeError as error:
-                raise self.wrong_value(path, f"cannot be encoded: {error}") from error
+                raise self.with_place(error, path) from None
             self.count(len(wide) // 4)
             self.data += wide
         else:
@@ -406,6 +406,10 @@ class _Encoder:
             f"{self.type_name}: field {path!r} must be {expected}, "
             f"but is {type(value).__name__} {shown}"
         )
+
+    def with_place(self, error: UnicodeEncodeError, path: str) -> UnicodeEncodeError:
+        error.reason += f" ({self.type_name}: field {path!r})"
+        return error
 
     def wrong_value(self, path: str, problem: str) -> ValueError:
         return ValueError(f"{self.type_name}: field {path!r} {problem}")
