@@ -9,9 +9,7 @@ messages are Python's. Type checkers see Python's.
 from __future__ import annotations
 
 import dataclasses
-import typing
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache, partial
 from operator import attrgetter
 from types import FunctionType
@@ -32,20 +30,6 @@ else:
 _pythons = dataclasses.dataclass
 _assign = object.__setattr__
 _NO_DEFAULT = object()
-
-
-@contextmanager
-def quick_imports() -> Iterator[None]:
-    """Let packages that are imported make their dataclasses so, too, and compile equal annotations
-    once: both are a third of pydantic's import."""
-    compiled: Any = typing
-    compiled.compile = cache(compile)
-    dataclasses.dataclass = dataclass
-    try:
-        yield
-    finally:
-        dataclasses.dataclass = _pythons
-        del compiled.compile
 
 
 def _decorate(cls: Any, *, eq: bool, frozen: bool, slots: bool) -> Any:

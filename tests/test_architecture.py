@@ -235,7 +235,6 @@ def replaced_methods(modules: dict[str, ast.Module]) -> set[tuple[str, str]]:
 
 
 _NO_METHODS_OF_OURS = {
-    ("rsltrace/fast_dataclass.py", "compile"): "a function that the module typing calls",
     ("rsltrace/run/session.py", "note_answer"): "a hook of ProcessAdapter: the guard is made later",
     ("rsltrace/adapters/rclpy/boundary/installation.py", "publish"): "of rclpy's Publisher",
     ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "__init__"): "of asyncio's loops",

@@ -10,7 +10,6 @@ import inspect
 import pickle
 import subprocess
 import sys
-import typing
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -185,27 +184,6 @@ def test_a_quick_dataclass_inherits_fields_as_pythons_does(given: Any, slots: bo
         if slots:
             assert one.__slots__ == list(other.__slots__)
         assert list(inspect.signature(one).parameters) == list(inspect.signature(other).parameters)
-
-
-def test_packages_that_are_imported_quickly_have_dataclasses_as_pythons(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "made_quickly.py").write_text(
-        "import dataclasses, typing\n"
-        "@dataclasses.dataclass(kw_only=True)\nclass Own:\n    a: int\n"
-        "@dataclasses.dataclass\nclass Quick:\n    a: typing.Optional['int'] = 2\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    before = dataclasses.dataclass
-    with fast_dataclass.quick_imports():
-        made = importlib.import_module("made_quickly")
-    assert dataclasses.dataclass is before
-    assert not hasattr(typing, "compile")
-    assert "_compared" in vars(made.Quick)
-    assert "_compared" not in vars(made.Own)
-    assert repr(made.Own(a=1)) == "Own(a=1)"
-    assert repr(made.Quick()) == "Quick(a=2)"
-    assert typing.get_type_hints(made.Quick) == {"a": int | None}
 
 
 def test_versions_are_those_of_the_packages_metadata() -> None:

@@ -6,14 +6,12 @@ from collections.abc import Callable, Iterable
 from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any
 
+from pydantic import BeforeValidator, ValidationInfo
+
 from rsltrace.errors import nearest
-from rsltrace.fast_dataclass import quick_imports
 from rsltrace.job.values.names import check_glob
 from rsltrace.job.values.problem import JobProblem, ProblemCollector, as_flag, describe
 from rsltrace.job.values.times import TIME_SCHEMA, parse_time
-
-with quick_imports():  # of all that the parts of a job need
-    from pydantic import BaseModel, BeforeValidator, Field, ValidationInfo  # noqa: F401
 
 FROM_FILE = {"from_file": True}
 """The validation context of a job that is read from a file."""

@@ -29,7 +29,6 @@ _REMAP_TO = rf"(?a){_RULE_NAME}"
 _MODULE = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _TARGET = rf"{_MODULE}:{_MODULE}"
 _FILE_TARGET = rf"(?:\./)?((?:[^\W\d]\w*/)*[^\W\d]\w*)\.py:({_MODULE})"
-_MODULE_NAME = _MODULE
 _EXECUTABLE = r"(?a)[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+"
 _COMPONENT = r"(?a)[A-Za-z0-9_.-]+/[A-Za-z_]\w*(?:(?:::|[.:])[A-Za-z_]\w*)*"
 
@@ -107,10 +106,10 @@ def _as_target(text: str) -> str:
     path, _, attribute = text.partition(":")
     folder, _, file = path.removesuffix(".py").rpartition("/")
     module = f"{folder}/{file}".replace("/", ".").strip(".")
-    if path and (attribute or path.endswith(".py")) and not _MODULE_NAME.fullmatch(file):
+    if path and (attribute or path.endswith(".py")) and not re.fullmatch(_MODULE, file):
         return f"; {file!r} cannot be a module's name: rename the file, or run it with script:"
     if path.endswith(".py"):
-        below = not path.startswith(("/", "../")) and _MODULE_NAME.fullmatch(module)
+        below = not path.startswith(("/", "../")) and re.fullmatch(_MODULE, module)
         if attribute and not below:
             return f"; add {folder or '/'} to search_path and write {file}:{attribute}"
         return f"; a module is named with dots: {module}:{attribute or 'Class'}"
@@ -135,7 +134,7 @@ def check_component(name: str) -> None:
 
 def check_module(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` looks like ``package.module``."""
-    if not re.fullmatch(_MODULE_NAME, name) or name.endswith(".py"):
+    if not re.fullmatch(_MODULE, name) or name.endswith(".py"):
         path = name.partition(":")[0]
         hint = f"; a file is named by 'script: {name}'" if path.endswith(".py") else ""
         hint = hint or (f"; a function is named by 'main: {name}'" if ":" in name else "")
