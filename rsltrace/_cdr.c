@@ -6,13 +6,9 @@
    No Python code runs between the first look at a message and its last byte, so that nothing changes
    under our feet. Messages do not nest in themselves: recursion is as deep as their definitions. */
 
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030A0000
-#include <Python.h>
+#include "_core.h"
+
 #include <math.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
 
 enum { HEADER = 4, GUESS_MAX = 1 << 20, COPIED_ONCE = 4096 };
 enum { SINGLE, ARRAY, SEQUENCE };
@@ -457,25 +453,18 @@ static Py_ssize_t slot_offset(const Plan *plan, PyObject *name) {
   return offset;
 }
 
-static PyObject *imported(const char *module, const char *name) {
-  PyObject *from = PyImport_ImportModule(module);
-  PyObject *found = from == NULL ? NULL : PyObject_GetAttrString(from, name);
-  Py_XDECREF(from);
-  return found;
-}
-
 /* At the first plan: not all who import this module need numpy. */
 static int find_types(void) {
   PyObject *table;
   if (new_numpy_array != NULL) return 0;
-  array_type = (PyTypeObject *)imported("array", "array");
-  numpy_array_type = (PyTypeObject *)imported("numpy", "ndarray");
+  array_type = (PyTypeObject *)attribute_of("array", "array");
+  numpy_array_type = (PyTypeObject *)attribute_of("numpy", "ndarray");
   frombytes = PyUnicode_InternFromString("frombytes");
   if (array_type == NULL || numpy_array_type == NULL || frombytes == NULL) return -1;
-  table = imported("numpy._core._multiarray_umath", "_ARRAY_API");
+  table = attribute_of("numpy._core._multiarray_umath", "_ARRAY_API");
   if (table == NULL) { /* numpy 1 */
     PyErr_Clear();
-    table = imported("numpy.core._multiarray_umath", "_ARRAY_API");
+    table = attribute_of("numpy.core._multiarray_umath", "_ARRAY_API");
   }
   if (table != NULL) {
     void **functions = PyCapsule_GetPointer(table, NULL);

@@ -213,8 +213,21 @@ static int end_piece(Buffer *self) {
   PyObject *piece = bytes_of(self->records.data, self->records.size);
   const int result = piece == NULL ? -1 : PyList_Append(self->pieces, piece);
   Py_XDECREF(piece);
-  self->records.size = 0;
+  if (result == 0) self->records.size = 0;
   return result;
+}
+
+/* Adds a message, or nothing of it if there is no memory. */
+static int add_record(Buffer *self, const uint8_t *header, PyObject *data, const char *content,
+                      Py_ssize_t size) {
+  const size_t before = self->records.size;
+  if (append(&self->headers, header, HEADER) < 0) return -1;
+  if (append(&self->records, header, HEADER) == 0 &&
+      (size < LARGE ? append(&self->records, content, size) : end_piece(self)) == 0)
+    return size < LARGE ? 0 : PyList_Append(self->pieces, data);
+  self->headers.size -= HEADER;
+  self->records.size = before;
+  return -1;
 }
 
 /* Returns the sequence of the message in its channel. */
@@ -238,16 +251,12 @@ static PyObject *add_payload(Buffer *self, PyObject *channel, PyObject *stamp, P
   else if (pack_by("rsltrace.trace.mcap.records", "MESSAGE_HEAD", header, HEADER,
                    Py_BuildValue("inOKOO", MESSAGE, length, channel, number, stamp, stamp)) < 0)
     return NULL;
-  next = PyLong_FromUnsignedLongLong(number + 1);
-  if (next == NULL || append(&self->headers, header, HEADER) < 0 ||
-      append(&self->records, header, HEADER) < 0 ||
-      (size < LARGE ? append(&self->records, content, size)
-                    : end_piece(self) < 0 || PyList_Append(self->pieces, data)) ||
-      PyList_SetItem(self->sequences, place, next) < 0)
-    return NULL;
+  if (add_record(self, header, data, content, size) < 0) return NULL;
   self->payload_bytes += size + HEADER;
+  next = PyLong_FromUnsignedLongLong(number + 1);
+  if (next == NULL || PyList_SetItem(self->sequences, place, next) < 0) return NULL;
   if ((self->payload_bytes >= self->payload_bytes_max || number + 1 >= U32) &&
-      done(PyObject_CallObject(self->write_payloads, NULL)) < 0)
+      done(PyObject_CallFunctionObjArgs(self->write_payloads, NULL)) < 0)
     return NULL;
   return PyLong_FromUnsignedLongLong(number);
 }
@@ -257,7 +266,7 @@ static int add_event(Buffer *self, const uint8_t *row) {
   if (append(&self->events, row, EVENT) < 0) return -1;
   if (self->events.size >= (size_t)self->events_max * EVENT ||
       self->contents.size >= (size_t)self->outputs_max * CONTENT)
-    return done(PyObject_CallObject(self->write_segment, NULL));
+    return done(PyObject_CallFunctionObjArgs(self->write_segment, NULL));
   return 0;
 }
 
@@ -304,12 +313,18 @@ static PyObject *buffer_add_sequence(Buffer *self, PyObject *sequence) {
 }
 
 static PyObject *buffer_take_payloads(Buffer *self, PyObject *Py_UNUSED(none)) {
-  PyObject *taken;
-  if (self->records.size && end_piece(self) < 0) return NULL;
-  taken = Py_BuildValue("NN", bytes_of(self->headers.data, self->headers.size),
-                        PyList_AsTuple(self->pieces));
-  if (taken == NULL || PyList_SetSlice(self->pieces, 0, PY_SSIZE_T_MAX, NULL) < 0) return NULL;
+  PyObject *none_yet = PyList_New(0), *pieces = self->pieces, *headers = NULL, *taken;
+  /* What may collect garbage, which may publish, comes before or after all of this. */
+  if (none_yet != NULL && (self->records.size == 0 || end_piece(self) == 0))
+    headers = bytes_of(self->headers.data, self->headers.size);
+  if (headers == NULL) {
+    Py_XDECREF(none_yet);
+    return NULL;
+  }
+  self->pieces = none_yet;
   self->headers.size = self->payload_bytes = 0;
+  taken = Py_BuildValue("NN", headers, PyList_AsTuple(pieces));
+  Py_DECREF(pieces);
   return taken;
 }
 
@@ -409,8 +424,10 @@ static int chain_init(Chain *self, PyObject *args, PyObject *named) {
   PyObject *writer;
   Buffer *buffer;
   if (!PyArg_ParseTupleAndKeywords(args, named, "O", names, &writer)) return -1;
-  chain_clear((PyObject *)self);
-  self->index = self->chain_hash = self->outputs = self->output_hash = 0;
+  if (self->observers != NULL) {
+    PyErr_SetString(PyExc_TypeError, "a chain begins once: it may be adding something");
+    return -1;
+  }
   self->observers = PyTuple_New(0);
   self->add_event = PyObject_GetAttrString(writer, "add_event");
   self->add_output = PyObject_GetAttrString(writer, "add_output");
@@ -1205,9 +1222,9 @@ static PyObject *next_deadline(int64_t now, int64_t deadline, int64_t period) {
   return PyLong_FromLongLong(deadline);
 }
 
-static PyObject *hash_of_deadline(PyObject *recorder, int64_t deadline) {
+static PyObject *hash_of_deadline(int is_recorded, int64_t deadline) {
   PyObject *packed, *hash;
-  if (recorder == Py_None) return Py_NewRef(zero);
+  if (!is_recorded) return Py_NewRef(zero);
   packed = bytes_of((uint8_t *)&deadline, 8);
   hash = packed == NULL ? NULL : PyObject_CallFunctionObjArgs(hash64, packed, NULL);
   Py_XDECREF(packed);
@@ -1237,7 +1254,7 @@ static PyObject *timer_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
   int64_t now = 0, deadline = 0, period = 0;
   int failed, usual = entry == NULL ? -1 : is_usual(self, timer_callback);
   if (usual > 0) {
-    /* Nothing from here on to the replacement in the heap runs code of Python. */
+    /* Nothing from here on to the replacements runs code of Python. */
     dispatcher = (Dispatcher *)self->dispatcher;
     state = (TimerState *)self->state;
     usual = HAS_FIELDS(dispatcher, Dispatcher, dispatcher) &&
@@ -1255,24 +1272,26 @@ static PyObject *timer_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
     Py_XDECREF(entry);
     return usual < 0 ? NULL : PyObject_CallMethod((PyObject *)self, "dispatch_any", NULL);
   }
-  PyObject *hash = hash_of_deadline(dispatcher->recorder, deadline);
-  PyObject *next = next_deadline(now, deadline, period), *cause[3] = {no_event, zero, hash};
+  const int is_recorded = dispatcher->recorder != Py_None;
+  PyObject *next = next_deadline(now, deadline, period), *cause[3] = {no_event, zero, NULL};
   PyObject *heap = Py_NewRef(queue->heap), *callback = Py_NewRef(self->callback);
   Py_INCREF(queue);
-  PyTuple_SetItem(entry, 0, Py_XNewRef(next));
-  PyTuple_SetItem(entry, 1, Py_NewRef(state->order));
-  PyTuple_SetItem(entry, 2, Py_NewRef((PyObject *)state));
-  failed = hash == NULL || next == NULL ||
+  /* Who holds all objects, as a profiler of memory may, makes these fail. */
+  failed = next == NULL || PyTuple_SetItem(entry, 0, Py_NewRef(next)) < 0 ||
+           PyTuple_SetItem(entry, 1, Py_NewRef(state->order)) < 0 ||
+           PyTuple_SetItem(entry, 2, Py_NewRef((PyObject *)state)) < 0 ||
            set(&state->last_call_ns, Py_NewRef(loop->now_ns)) < 0 ||
            set(&state->deadline_ns, Py_NewRef(next)) < 0 ||
            set(&state->ticket, Py_NewRef(entry)) < 0 ||
            done(PyObject_CallFunctionObjArgs(heapreplace, heap, entry, NULL)) < 0 ||
-           find_first(queue, heap) < 0 || run_callback(self, TIMER, callback, no_args, cause);
+           find_first(queue, heap) < 0 ||
+           (cause[2] = hash_of_deadline(is_recorded, deadline)) == NULL ||
+           run_callback(self, TIMER, callback, no_args, cause);
   Py_DECREF(queue);
   Py_DECREF(callback);
   Py_DECREF(heap);
   Py_XDECREF(next);
-  Py_XDECREF(hash);
+  Py_XDECREF(cause[2]);
   Py_DECREF(entry);
   return failed ? NULL : Py_NewRef(Py_None);
 }

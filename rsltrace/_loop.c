@@ -172,10 +172,9 @@ static int enter(Link *self, PyObject *const *held, PyObject *release, PyObject 
 
 static int send_plainly(Link *self, PyObject *const *message) {
   PyObject *held[HELD], *leaves_ns, *delay_ns = NULL, *arrival_ns = NULL, *release = NULL;
-  int failed, is_busy;
+  int failed;
   if (hold(self, held) < 0) return -1;
-  is_busy = PyObject_IsTrue(held[BUSY_NS]);
-  leaves_ns = is_busy ? PyNumber_Add(held[NOW_NS], held[BUSY_NS]) : Py_NewRef(held[NOW_NS]);
+  leaves_ns = PyNumber_Add(held[NOW_NS], held[BUSY_NS]);
   failed = leaves_ns == NULL ||
            draw_delay(self, held[SAMPLER], leaves_ns, &delay_ns, &arrival_ns) < 0 ||
            record_delay(held[RECORDER], held[ENTITY_ID], delay_ns) < 0;
@@ -239,18 +238,16 @@ static Py_ssize_t size_of(PyObject *queue) {
   return size;
 }
 
-/* Returns the time of the first release, borrowed; NULL if there is none, or with an error. */
-static PyObject *first_ns(WholeLoop *self) {
-  PyObject *first;
-  if (!PyList_Check(self->scheduled)) {
-    PyErr_SetString(PyExc_TypeError, "what is scheduled is no list");
-    return NULL;
+/* Returns the time of the first release; -1 if there is none, or with an error. */
+static __int128 first_ns(WholeLoop *self) {
+  PyObject *first = Py_None;
+  if (PyList_Check(self->scheduled)) {
+    if (PyList_Size(self->scheduled) == 0) return -1;
+    first = PyList_GetItem(self->scheduled, 0);
   }
-  if (PyList_Size(self->scheduled) == 0) return NULL;
-  first = PyList_GetItem(self->scheduled, 0);
-  return PyTuple_Check(first) && PyTuple_Size(first) > 3
-             ? PyTuple_GetItem(first, 0)
-             : (PyErr_SetString(PyExc_TypeError, "what is scheduled is no release"), NULL);
+  if (PyTuple_Check(first) && PyTuple_Size(first) > 3) return number_of(PyTuple_GetItem(first, 0));
+  PyErr_SetString(PyExc_TypeError, "what is scheduled is no release");
+  return -1;
 }
 
 static __int128 next_timer_ns(WholeLoop *self) {
@@ -264,8 +261,7 @@ static __int128 next_timer_ns(WholeLoop *self) {
 
 /* Whether the next arrival is all that the loop has to look at; not so, possibly, with an error. */
 static int is_next(WholeLoop *self) {
-  PyObject *time = first_ns(self);
-  const __int128 next_ns = time == NULL ? -1 : number_of(time);
+  const __int128 next_ns = first_ns(self);
   return next_ns >= 0 && size_of(self->of_events.ready) == 0 && size_of(self->tasks) == 0 &&
          size_of(self->idle) == 0 && self->gate == Py_None &&
          next_ns > number_of(self->of_events.now_ns) && next_ns < number_of(self->quiet_ns) &&
@@ -287,9 +283,9 @@ static PyObject *receiver_of(PyObject *release) {
 
 /* Lets the arrival and the others of its time be dispatched in order; returns who is next. */
 static PyObject *first_ready(WholeLoop *self, PyObject *receiver) {
-  PyObject *ready = Py_NewRef(self->of_events.ready), *time = first_ns(self), *first = NULL;
-  const int is_due =
-      time == NULL ? 0 : number_of(time) <= number_of(self->of_events.now_ns);
+  PyObject *ready = Py_NewRef(self->of_events.ready), *first = NULL;
+  const __int128 next_ns = first_ns(self);
+  const int is_due = next_ns >= 0 && next_ns <= number_of(self->of_events.now_ns);
   if (!PyErr_Occurred()) {
     if (is_due)
       first = receiver != Py_None && append_to(ready, receiver) < 0 ? NULL : Py_NewRef(Py_None);
@@ -338,9 +334,7 @@ int add_loop_types(PyObject *module) {
   send_name = PyUnicode_InternFromString("send");
   loop_type = loop_made(loop_fields, loop_methods);
   link_type = link_made(link_fields, link_methods);
-  if (heappush == NULL || heappop == NULL || order_release == NULL || minus_one == NULL ||
-      next_ns_name == NULL || popleft_name == NULL || send_name == NULL ||
-      loop_type == NULL || link_type == NULL ||
+  if (PyErr_Occurred() ||
       PyModule_AddObjectRef(module, "LoopFields", (PyObject *)loop_type) < 0)
     return -1;
   return PyModule_AddObjectRef(module, "LinkFields", (PyObject *)link_type);

@@ -297,6 +297,27 @@ def test_a_queue_of_timers_that_is_none_does_not_crash(simulate: Any, wrong: Any
         simulate(Breaks, duration=1)
 
 
+def test_a_timer_whose_objects_somebody_else_holds_does_not_crash(simulate: Any) -> None:
+    held: list[Any] = []
+
+    class Held(Node):
+        def __init__(self) -> None:
+            super().__init__("held")
+            self.timer = self.create_timer(0.1, lambda: None)
+            group = self.timer.callback_group
+
+            def look(timer: Any) -> Any:
+                held.append(gc.get_objects())
+                return group
+
+            looking = property(look, lambda timer, value: None)
+            self.timer.__class__ = type("Looking", (type(self.timer),), {"callback_group": looking})
+
+    with contextlib.suppress(Exception):
+        simulate(Held, duration=0.3)
+    assert held
+
+
 def test_a_publisher_that_has_lost_a_field_does_not_crash(simulate: Any) -> None:
     refused: list[str] = []
 

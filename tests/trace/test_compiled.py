@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import os
 import random
 import subprocess
@@ -16,7 +18,7 @@ import pytest
 
 from rsltrace import compiled
 from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
-from rsltrace.trace.mcap.chunk_builder import LARGE_BYTES
+from rsltrace.trace.mcap.chunk_builder import LARGE_BYTES, messages_chunk
 from rsltrace.trace.recorder import PythonEventChain
 from rsltrace.trace.writer import PythonRecordBuffer
 
@@ -169,6 +171,61 @@ def test_unfinished_events_are_dropped_alike() -> None:
             writer.buffer.drop_unfinished()
             states.append(writer.state())
         assert states[0] == states[1]
+
+
+@needs_core
+def test_garbage_that_adds_a_message_while_they_are_taken_loses_none() -> None:
+    class Garbage:
+        def __init__(self, buffer: Any) -> None:
+            self.itself, self.buffer = self, buffer
+
+        def __del__(self) -> None:
+            self.buffer.add_payload(1, 5, b"late")
+
+    for later in range(20):
+        buffer = core.RecordBuffer(
+            len, len, [0, 0], events_max=1, outputs_max=1, payload_bytes_max=1 << 30
+        )
+        buffer.add_payload(1, 1, b"early")
+        gc.collect()
+        Garbage(buffer)
+        kept = gc.get_threshold()
+        gc.set_threshold(gc.get_count()[0] + later)
+        try:
+            taken = [buffer.take_payloads()]
+        finally:
+            gc.set_threshold(*kept)
+        gc.collect()
+        taken.append(buffer.take_payloads())
+        chunks = [messages_chunk(*each) for each in taken if each[0]]
+        assert sum(count for chunk in chunks for _, count, _ in chunk.indexes) == 2, later
+
+
+@needs_core
+@pytest.mark.parametrize("size", [LARGE_BYTES - 1, LARGE_BYTES])
+def test_a_message_without_memory_is_not_added_by_half(size: int) -> None:
+    testing = pytest.importorskip("_testcapi")
+    for number in range(1, 5):
+        buffer = core.RecordBuffer(
+            len, len, [0, 0], events_max=1, outputs_max=1, payload_bytes_max=1 << 30
+        )
+        for _ in range(3):
+            buffer.add_payload(1, 1, bytes(20_000))
+        data = bytes(size)
+        with contextlib.suppress(MemoryError):
+            testing.set_nomemory(number, number + 1)
+            try:
+                buffer.add_payload(1, 1, data)
+            finally:
+                testing.remove_mem_hooks()
+        assert messages_chunk(*buffer.take_payloads()).indexes, number
+
+
+@needs_core
+def test_a_chain_does_not_begin_anew_while_it_adds() -> None:
+    writer = Writer(core.RecordBuffer, core.EventChain, direct=True)
+    with pytest.raises(TypeError, match="begins once"):
+        writer.chain.__init__(writer)  # its buffer could go while a message is added to it
 
 
 @needs_core
