@@ -578,5 +578,5 @@ static PyType_Spec plan_spec = {
 
 int add_message_plan(PyObject *module) {
   plan_type = (PyTypeObject *)PyType_FromSpec(&plan_spec);
-  return plan_type == NULL ? -1 : PyModule_AddObjectRef(module, "MessagePlan", (PyObject *)plan_type);
+  return plan_type == NULL ? -1 : PyModule_AddType(module, plan_type);
 }

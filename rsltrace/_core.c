@@ -109,7 +109,7 @@ static PyObject *bytes_of(const uint8_t *data, Py_ssize_t size) {
   return PyBytes_FromStringAndSize((const char *)data, size);
 }
 
-static int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_ssize_t most) {
+int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_ssize_t most) {
   if (count >= least && count <= most) return 0;
   PyErr_Format(PyExc_TypeError, "%s() got %zd arguments", name, count);
   return -1;
@@ -615,12 +615,12 @@ typedef struct {
 static PyTypeObject *timer_type, *timers_type;
 static PyObject *timer_seen, *timers_seen;
 
-FIELDS(Event, event)
-FIELDS(Dispatcher, dispatcher)
-FIELDS(Entity, entity)
-FIELDS(Sites, sites)
-FIELDS(TimerState, timer)
-FIELDS(TimerQueue, timers)
+FIELDS(Event, event, "EventFields")
+FIELDS(Dispatcher, dispatcher, "EventEnd")
+FIELDS(Entity, entity, "EntityFields")
+FIELDS(Sites, sites, "SitesFields")
+FIELDS(TimerState, timer, "TimerStateFields")
+FIELDS(TimerQueue, timers, "TimerQueueFields")
 
 PyMemberDef event_fields[] = {
     FIELD(Event, handle, "handle"),
@@ -932,30 +932,21 @@ static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
   return HAS_FIELDS(loop, Loop, loop) ? append_to(loop->ready, subscription) : -1;
 }
 
-/* `message` is a delivery from the CDR on. */
-static int deliver_to_all(Entity *self, PyObject *const *message, PyObject *now_ns, Loop *loop) {
-  PyObject *all = Py_NewRef(self->subscriptions); /* packing may collect garbage: it may publish */
-  PyObject *delivery = PyTuple_Pack(10, now_ns, zero, zero, Py_None, message[0], message[1],
-                                    message[2], message[3], message[4], message[5]);
-  int failed = delivery == NULL || PyList_Size(all) < 0;
+/* Sends over the links or, without any, to the subscriptions. `message` is a delivery from the CDR
+   on. */
+static int send_to_all(Entity *self, PyObject *const *message, PyObject *now_ns, Loop *loop) {
+  const int has_links = self->links != Py_None;
+  PyObject *all = Py_NewRef(has_links ? self->links : self->subscriptions), *delivery = NULL;
+  if (!has_links) /* packing may collect garbage: it may publish */
+    delivery = PyTuple_Pack(10, now_ns, zero, zero, Py_None, message[0], message[1], message[2],
+                            message[3], message[4], message[5]);
+  int failed = (!has_links && delivery == NULL) || PyList_Size(all) < 0;
   for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
-    PyObject *subscription = Py_NewRef(PyList_GetItem(all, i));
-    failed = deliver(subscription, delivery, loop) < 0;
-    Py_DECREF(subscription);
+    PyObject *to = Py_NewRef(PyList_GetItem(all, i));
+    failed = (has_links ? send_over(to, message) : deliver(to, delivery, loop)) < 0;
+    Py_DECREF(to);
   }
   Py_XDECREF(delivery);
-  Py_DECREF(all);
-  return failed;
-}
-
-static int send_over_links(Entity *self, PyObject *const *message) {
-  PyObject *all = Py_NewRef(self->links);
-  int failed = PyList_Size(all) < 0;
-  for (Py_ssize_t i = 0; i < PyList_Size(all) && !failed; ++i) {
-    PyObject *link = Py_NewRef(PyList_GetItem(all, i));
-    failed = send_over(link, message) < 0;
-    Py_DECREF(link);
-  }
   Py_DECREF(all);
   return failed;
 }
@@ -1001,8 +992,7 @@ static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
     PyObject *events = Py_NewRef(loop->events), *number = Py_NewRef(self->count);
     PyObject *message[] = {data, events, position, digest, now_ns, number};
     failed = set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 || !is_publisher((PyObject *)self) ||
-             (self->links == Py_None ? deliver_to_all(self, message, now_ns, loop)
-                                     : send_over_links(self, message));
+             send_to_all(self, message, now_ns, loop);
     Py_DECREF(number);
     Py_DECREF(events);
   }
@@ -1302,12 +1292,13 @@ static PyMethodDef timer_methods[] = {
 };
 
 /* The fields of an entity, and the method of a publisher, subscription or timer. */
-static PyObject *entity_with(PyMethodDef *methods, const char *name) {
+static PyTypeObject *entity_with(PyMethodDef *methods, const char *name) {
   PyType_Slot slots[] = {{Py_tp_methods, methods}, {0, NULL}};
   PyType_Spec spec = {
       name, sizeof(Entity), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, slots,
   };
-  return entity_type == NULL ? NULL : PyType_FromSpecWithBases(&spec, (PyObject *)entity_type);
+  if (entity_type == NULL) return NULL;
+  return (PyTypeObject *)PyType_FromSpecWithBases(&spec, (PyObject *)entity_type);
 }
 
 static int add_types(PyObject *module) {
@@ -1337,23 +1328,16 @@ static int add_types(PyObject *module) {
   sites_type = sites_made(sites_fields, no_methods);
   timer_type = timer_made(timer_fields, no_methods);
   timers_type = timers_made(timers_fields, no_methods);
-  const struct {
-    const char *name;
-    PyObject *object;
-  } all[] = {
-      {"RecordBuffer", (PyObject *)buffer_type},   {"EventChain", (PyObject *)chain_type},
-      {"EventFields", (PyObject *)event_type},     {"EventEnd", (PyObject *)dispatcher_type},
-      {"EntityFields", (PyObject *)entity_type},   {"SitesFields", (PyObject *)sites_type},
-      {"TimerStateFields", (PyObject *)timer_type},
-      {"TimerQueueFields", (PyObject *)timers_type},
-      {"PublisherFields", entity_with(publisher_methods, "rsltrace._core.PublisherFields")},
-      {"SubscriptionFields",
-       entity_with(subscription_methods, "rsltrace._core.SubscriptionFields")},
-      {"TimerFields", entity_with(timer_methods, "rsltrace._core.TimerFields")},
+  PyTypeObject *all[] = {
+      buffer_type, chain_type, event_type, dispatcher_type, entity_type, sites_type, timer_type,
+      timers_type,
+      entity_with(publisher_methods, "rsltrace._core.PublisherFields"),
+      entity_with(subscription_methods, "rsltrace._core.SubscriptionFields"),
+      entity_with(timer_methods, "rsltrace._core.TimerFields"),
   };
   if (PyErr_Occurred()) return -1;
   for (size_t i = 0; i < sizeof all / sizeof *all; ++i)
-    if (PyModule_AddObjectRef(module, all[i].name, all[i].object) < 0) return -1;
+    if (PyModule_AddType(module, all[i]) < 0) return -1;
   return 0;
 }
 

@@ -80,7 +80,7 @@ extern PyMemberDef loop_fields[], event_fields[], dispatcher_fields[], entity_fi
     Py_DECREF(type);                                                                 \
   }
 
-#define FIELDS(Struct, prefix)                                                       \
+#define FIELDS(Struct, prefix, name)                                                 \
   OBJECTS(prefix, FIELD_COUNT(Struct))                                               \
   static PyTypeObject *prefix##_made(PyMemberDef *fields,  PyMethodDef *methods) {   \
     PyType_Slot slots[] = {                                                          \
@@ -89,7 +89,7 @@ extern PyMemberDef loop_fields[], event_fields[], dispatcher_fields[], entity_fi
         {Py_tp_methods, methods},          {0, NULL},                                \
     };                                                                               \
     PyType_Spec spec = {                                                             \
-        "rsltrace._core." #Struct "Fields", sizeof(Struct), 0,                       \
+        "rsltrace._core." name, sizeof(Struct), 0,                                   \
         Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, slots,        \
     };                                                                               \
     return (PyTypeObject *)PyType_FromSpec(&spec);                                   \
@@ -133,6 +133,7 @@ int set(PyObject **field, PyObject *value);
 
 PyObject *attribute_of(const char *module_name, const char *name);
 int done(PyObject *result);
+int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_ssize_t most);
 int append_to(PyObject *queue, PyObject *item);
 int record_draw(PyObject *recorder, PyObject *entity, unsigned long long draw);
 

@@ -16,8 +16,8 @@ static PyObject *link_seen;
 static PyObject *heappush, *heappop, *order_release, *minus_one;
 static PyObject *next_ns_name, *popleft_name, *send_name;
 
-FIELDS(WholeLoop, loop)
-FIELDS(Link, link)
+FIELDS(WholeLoop, loop, "LoopFields")
+FIELDS(Link, link, "LinkFields")
 
 PyMemberDef loop_fields[] = {
     FIELD(Loop, now_ns, "now_ns"),
@@ -189,11 +189,7 @@ static int send_plainly(Link *self, PyObject *const *message) {
 }
 
 static PyObject *link_send(Link *self, PyObject *const *args, Py_ssize_t count) {
-  if (count != 6) {
-    PyErr_Format(PyExc_TypeError, "send() got %zd arguments", count);
-    return NULL;
-  }
-  return send_plainly(self, args) < 0 ? NULL : Py_NewRef(Py_None);
+  return check_count("send", count, 6, 6) < 0 || send_plainly(self, args) < 0 ? NULL : Py_NewRef(Py_None);
 }
 
 #define LINK_SEND ((PyCFunction)(void (*)(void))link_send)
@@ -334,8 +330,6 @@ int add_loop_types(PyObject *module) {
   send_name = PyUnicode_InternFromString("send");
   loop_type = loop_made(loop_fields, loop_methods);
   link_type = link_made(link_fields, link_methods);
-  if (PyErr_Occurred() ||
-      PyModule_AddObjectRef(module, "LoopFields", (PyObject *)loop_type) < 0)
-    return -1;
-  return PyModule_AddObjectRef(module, "LinkFields", (PyObject *)link_type);
+  if (PyErr_Occurred() || PyModule_AddType(module, loop_type) < 0) return -1;
+  return PyModule_AddType(module, link_type);
 }
