@@ -103,6 +103,68 @@ def test_mains_threads_services_and_blocking_calls(feature: str, tmp_path: Path)
     unchanged(tmp_path / "run.mcap", tmp_path, twice=not feature)
 
 
+TIMED = """
+import time
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+class Server(Node):
+    def __init__(self):
+        super().__init__('server')
+        self.create_service(Trigger, 'asked', self.answer)
+    def answer(self, request, response):
+        time.sleep(0.004)
+        return response
+
+class Asker(Node):
+    def __init__(self):
+        super().__init__('asker')
+        group = ReentrantCallbackGroup()
+        self.client = self.create_client(Trigger, 'asked', callback_group=group)
+        self.said = self.create_publisher(String, 'said', 10)
+        self.create_timer(0.05, self.wait, callback_group=group)
+        self.create_timer(0.03, self.block, callback_group=group)
+    def say(self, what):
+        self.said.publish(String(data=what))
+    async def wait(self):
+        self.say('coroutine')
+        await self.client.call_async(Trigger.Request())
+        self.say('coroutine goes on')
+        time.sleep(0.003)
+        self.say('coroutine has slept')
+    def block(self):
+        self.say('callback')
+        time.sleep(0.002)
+        self.say('callback has slept')
+        self.client.call(Trigger.Request())
+        self.say('callback goes on')
+
+class Echo(Node):
+    def __init__(self):
+        super().__init__('echo')
+        self.heard = self.create_publisher(String, 'heard', 10)
+        self.create_subscription(String, 'said', self.heard.publish, 10)
+"""
+
+
+@pytest.mark.parametrize("more", ["", "delay: {default: {uniform: {min: 0ms, max: 3ms}}}\n"])
+@pytest.mark.parametrize("times", ["nodes: {/asker: 1ms}", "default: 1ms"])
+def test_what_waiting_callbacks_with_execution_times_send(
+    times: str, more: str, tmp_path: Path
+) -> None:
+    """After blocking calls it leaves with the execution time; of coroutines that go on at once."""
+    (tmp_path / "timed.py").write_text(TIMED)
+    nodes = "".join(f"  - {{node: timed:{name}}}\n" for name in ("Server", "Asker", "Echo"))
+    (tmp_path / "job.yaml").write_text(
+        f"nodes:\n{nodes}execution: {{{times}}}\nexecutors: [{{nodes: [/asker], workers: 3}}]\n"
+        f"{more}stop: {{duration: 400ms}}\nseed: 3\n"
+    )
+    assert run(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap").error is None
+    unchanged(tmp_path / "run.mcap", tmp_path)
+
+
 @pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs")
 @pytest.mark.parametrize(

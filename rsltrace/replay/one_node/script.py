@@ -13,6 +13,7 @@ from rsltrace.errors import ReplayError, near_or_all
 from rsltrace.job import Job
 from rsltrace.replay.one_node.result import SENT, Column, RecordingColumns
 from rsltrace.simulation.loop.recorded_input_loop import NEVER, RecordedStep
+from rsltrace.trace.departures import Departures
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,
@@ -20,8 +21,6 @@ from rsltrace.trace.model.event import (
     EventFlag,
     EventKind,
     OutputKind,
-    RandomDecision,
-    decision_duration,
 )
 
 # The entry of the job that made the node runs, with all that came from the same construction: an
@@ -211,7 +210,7 @@ class RecordedScript:
         self._counts: Counter[Key] = Counter()
         self._entities = {0: 0}
         self._present: dict[int, int] = {}
-        self._drawn: dict[int, int] = {}
+        self._late_ns = Departures().read(0, columns.events, columns.outputs)
 
     @cached_property
     def _events_of(self) -> dict[int, deque[int]]:
@@ -295,33 +294,24 @@ class RecordedScript:
         kinds = np.isin(outputs["kind"], (*SENT, OutputKind.ENTITY))
         matters = self._own.copy()
         matters[outputs["event"][kinds & self._others]] = True
-        draws = (outputs["kind"] == OutputKind.DRAW) & (
-            outputs["hash"] >> 56 == RandomDecision.EXECUTION
-        )
-        matters[outputs["event"][draws]] = True
         for index in np.flatnonzero(matters[: columns.count]).tolist():
             row = columns.events[index]
             stamp_ns, kind, entity = int(row["stamp"]), int(row["kind"]), int(row["entity"])
             if self._own[index]:
                 yield RecordedStep(index, stamp_ns, kind, entity)
-            perform = self._performed(index, kind, entity)
+            perform = self._performed(index)
             if perform is not None:
                 yield RecordedStep(index, stamp_ns, kind, entity, perform)
 
-    def _performed(self, index: int, kind: int, entity: int) -> Callable[[], None] | None:
+    def _performed(self, index: int) -> Callable[[], None] | None:
         entities = self._columns.trace.entities
         created: list[Entity] = []
         sent: list[tuple[int, Any]] = []
         begin = int(self._columns.first_output[index])
-        busy_ns = self._drawn.get(entity, 0) if kind == EventKind.RESUME else 0
         for place, row in enumerate(self._columns.outputs_of(index)):
-            if row["kind"] == OutputKind.DRAW:
-                drawn_ns = decision_duration(int(row["hash"]), RandomDecision.EXECUTION)
-                if drawn_ns is not None:
-                    busy_ns = self._drawn[entity] = drawn_ns
-            elif not self._others[begin + place]:
+            if not self._others[begin + place]:
                 continue
-            elif row["kind"] == OutputKind.ENTITY:
+            if row["kind"] == OutputKind.ENTITY:
                 one = entities[int(row["entity"])]
                 if one.kind in _ENDPOINTS:
                     created.append(one)
@@ -329,7 +319,7 @@ class RecordedScript:
                 sent.append((place, row))
         if not (created or sent):
             return None
-        return partial(self._perform, index, created, sent, busy_ns)
+        return partial(self._perform, index, created, sent, self._late_ns.get(index, 0))
 
 
 def _is(step: RecordedStep, kind: int, entity: int) -> bool:

@@ -51,6 +51,7 @@ def nested_too_deep(text: str) -> int:
 TIMER_CANCEL = 1
 TIMER_RESET = 2
 TIMER_PERIOD = 3
+RESUMES_COROUTINE = 1  # of a task
 
 pack_operation = struct.Struct("<Bq").pack
 """Packs an operation and a value in ns: a timer's next deadline, or its new period."""

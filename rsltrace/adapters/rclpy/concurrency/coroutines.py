@@ -16,6 +16,7 @@ from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox, describe_awaite
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.entity import Runnable
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.operation import RESUMES_COROUTINE
 
 _TASK = int(EventKind.TASK)
 _RESUME = int(EventKind.RESUME)
@@ -233,7 +234,7 @@ class ResumeTask:
     def __call__(self, future: Any) -> None:
         run, domain = self._run, self._run.domain
         run.cause_event = domain.loop.events
-        run.cause_output = domain.dispatcher.note(OutputKind.TASK, run.entity, 1)
+        run.cause_output = domain.dispatcher.note(OutputKind.TASK, run.entity, RESUMES_COROUTINE)
         run.input_hash = domain.event.input_hash
         domain.loop.tasks.append(run)
 
