@@ -378,10 +378,10 @@ static int fill_array(PyObject *made, const uint8_t *data, Py_ssize_t bytes) {
     return done;
   }
   PyObject *source = PyMemoryView_FromMemory((char *)data, bytes, TO_READ);
-  PyObject *none = source == NULL ? NULL : PyObject_CallMethodObjArgs(made, frombytes, source, NULL);
-  Py_XDECREF(source);
-  Py_XDECREF(none);
-  return none == NULL ? -1 : 0;
+  if (source == NULL) return -1;
+  const int result = done(PyObject_CallMethodObjArgs(made, frombytes, source, NULL));
+  Py_DECREF(source);
+  return result;
 }
 
 static PyObject *read_array(Input *in, const Field *field) {

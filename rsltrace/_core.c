@@ -932,8 +932,7 @@ static int deliver(PyObject *subscription, PyObject *delivery, Loop *loop) {
   return HAS_FIELDS(loop, Loop, loop) ? append_to(loop->ready, subscription) : -1;
 }
 
-/* Sends over the links or, without any, to the subscriptions. `message` is a delivery from the CDR
-   on. */
+/* Over the links, or to the subscriptions. `message` is a delivery from the CDR on. */
 static int send_to_all(Entity *self, PyObject *const *message, PyObject *now_ns, Loop *loop) {
   const int has_links = self->links != Py_None;
   PyObject *all = Py_NewRef(has_links ? self->links : self->subscriptions), *delivery = NULL;

@@ -44,14 +44,6 @@ static PyMemberDef link_fields[] = {
     FIELD(Link, arrive, "_arrives"),           NO_FIELD,
 };
 
-static int is_plain(PyObject *object) {
-  return has_fields(object, link_type, &link_seen, link_fields, 0, FIELD_COUNT(Link));
-}
-
-static int is_loop(PyObject *object) {
-  return has_fields(object, loop_type, &loop_seen, loop_fields, 0, FIELD_COUNT(WholeLoop));
-}
-
 /* -- links --------------------------------------------------------------------------------------- */
 
 /* Whether a built-in method is the given one of a link. */
@@ -64,7 +56,7 @@ static int is_method(PyObject *method, PyObject *link, PyCFunction function) {
 static PyObject *link_arrive(Link *self, PyObject *release) {
   PyObject *to, *receiver = NULL;
   int is_it = 0;
-  if (!is_plain((PyObject *)self)) return NULL;
+  if (!HAS_FIELDS(self, Link, link)) return NULL;
   to = Py_NewRef(self->subscription);
   if (!is_a(to, entity_type, &subscription_seen) || ((Entity *)to)->destroyed != Py_True)
     is_it = queue_arrival(to, release);
@@ -77,7 +69,7 @@ static PyObject *link_arrive(Link *self, PyObject *release) {
 enum { LOOP, ENTITY_ID, RECORDER, SAMPLER, ARRIVE, NOW_NS, BUSY_NS, NEXT_PLACE, HEAP, HELD };
 
 static int hold(Link *self, PyObject **held) {
-  if (!is_plain((PyObject *)self) || !is_loop(self->loop) ||
+  if (!HAS_FIELDS(self, Link, link) || !HAS_FIELDS(self->loop, WholeLoop, loop) ||
       !HAS_FIELDS(self->dispatcher, Dispatcher, dispatcher))
     return -1;
   const WholeLoop *loop = (WholeLoop *)self->loop;
@@ -110,7 +102,7 @@ static int draw_delay(Link *self, PyObject *sampler, PyObject *leaves_ns, PyObje
   PyObject *last_ns;
   int is_early;
   *delay_ns = PyObject_CallFunctionObjArgs(sampler, leaves_ns, NULL);
-  if (*delay_ns == NULL || !is_plain((PyObject *)self)) return -1;
+  if (*delay_ns == NULL || !HAS_FIELDS(self, Link, link)) return -1;
   last_ns = Py_NewRef(self->last_ns);
   *arrival_ns = PyNumber_Add(leaves_ns, *delay_ns);
   is_early = *arrival_ns == NULL ? -1 : PyObject_RichCompareBool(*arrival_ns, last_ns, Py_LT);
@@ -144,7 +136,7 @@ static int is_later(Link *self, PyObject *const *held, PyObject *delay_ns, PyObj
   PyObject *expects, *now_ns;
   int is_it = PyObject_IsTrue(delay_ns);
   if (is_it) return is_it;
-  if (!is_loop(held[LOOP])) return -1;
+  if (!HAS_FIELDS(held[LOOP], WholeLoop, loop)) return -1;
   now_ns = Py_NewRef(((Loop *)held[LOOP])->now_ns);
   is_it = PyObject_RichCompareBool(arrival_ns, now_ns, Py_NE);
   Py_DECREF(now_ns);
@@ -165,7 +157,8 @@ static int enter(Link *self, PyObject *const *held, PyObject *release, PyObject 
   receiver = link_arrive(self, release);
   if (receiver == NULL) return -1;
   failed = receiver != Py_None &&
-           (!is_loop(held[LOOP]) || append_to(((Loop *)held[LOOP])->ready, receiver) < 0);
+           (!HAS_FIELDS(held[LOOP], WholeLoop, loop) ||
+            append_to(((Loop *)held[LOOP])->ready, receiver) < 0);
   Py_DECREF(receiver);
   return failed ? -1 : 0;
 }
@@ -189,7 +182,8 @@ static int send_plainly(Link *self, PyObject *const *message) {
 }
 
 static PyObject *link_send(Link *self, PyObject *const *args, Py_ssize_t count) {
-  return check_count("send", count, 6, 6) < 0 || send_plainly(self, args) < 0 ? NULL : Py_NewRef(Py_None);
+  if (check_count("send", count, 6, 6) < 0 || send_plainly(self, args) < 0) return NULL;
+  Py_RETURN_NONE;
 }
 
 #define LINK_SEND ((PyCFunction)(void (*)(void))link_send)
@@ -262,7 +256,7 @@ static int is_next(WholeLoop *self) {
          size_of(self->idle) == 0 && self->gate == Py_None &&
          next_ns > number_of(self->of_events.now_ns) && next_ns < number_of(self->quiet_ns) &&
          number_of(self->of_events.events) < number_of(self->until_events) &&
-         number_of(self->min_step_ns) == 0 && is_loop((PyObject *)self) &&
+         number_of(self->min_step_ns) == 0 && HAS_FIELDS(self, WholeLoop, loop) &&
          next_ns < next_timer_ns(self);
 }
 
@@ -296,8 +290,8 @@ static PyObject *first_ready(WholeLoop *self, PyObject *receiver) {
 
 static PyObject *loop_next_arrival(WholeLoop *self, PyObject *Py_UNUSED(none)) {
   PyObject *heap, *release, *receiver, *first = NULL;
-  const int is_it = is_loop((PyObject *)self) && is_next(self);
-  if (PyErr_Occurred() || !is_loop((PyObject *)self)) return NULL;
+  const int is_it = HAS_FIELDS(self, WholeLoop, loop) && is_next(self);
+  if (PyErr_Occurred() || !HAS_FIELDS(self, WholeLoop, loop)) return NULL;
   if (!is_it) return Py_NewRef(Py_False);
   heap = Py_NewRef(self->scheduled);
   release = PyObject_CallFunctionObjArgs(heappop, heap, NULL);
@@ -308,7 +302,7 @@ static PyObject *loop_next_arrival(WholeLoop *self, PyObject *Py_UNUSED(none)) {
   } else if (set(&self->of_events.now_ns, Py_NewRef(PyTuple_GetItem(release, 0))) == 0 &&
              set(&self->looks_at, Py_NewRef(minus_one)) == 0) {
     receiver = receiver_of(release);
-    if (receiver != NULL && is_loop((PyObject *)self)) first = first_ready(self, receiver);
+    if (receiver != NULL && HAS_FIELDS(self, WholeLoop, loop)) first = first_ready(self, receiver);
     Py_XDECREF(receiver);
   }
   Py_DECREF(release);
