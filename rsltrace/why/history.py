@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.trace.departures import Departures
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,
@@ -130,7 +131,7 @@ class RunHistory:
         self, row: int, event: int, receiver: int, taken: dict[tuple[int, int], int]
     ) -> Message:
         sender, sent_ns = int(self.outputs["entity"][row]), self.stamp(event)
-        left_ns = sent_ns + self._executions.get(event, 0)
+        left_ns = sent_ns + self._late_ns.get(event, 0)
         first = int(self.firsts[event])
         output = row - first
         by = taken.get((event, output))
@@ -156,6 +157,10 @@ class RunHistory:
             duration_ns = decision_duration(number, kind)
             if duration_ns is not None and event < self.ended:
                 yield event, entity, duration_ns
+
+    @cached_property
+    def _late_ns(self) -> dict[int, int]:
+        return Departures().read(0, self.events, self.outputs)
 
     @cached_property
     def _executions(self) -> dict[int, int]:

@@ -10,11 +10,14 @@ from typing import Any
 import pytest
 
 import rsltrace
+from rsltrace.checks.latency.flow import MessageFlow
+from rsltrace.checks.latency.paths import ChainSelection
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
+from rsltrace.why.history import RunHistory
 from tests.replay.test_jobs_replay import EXAMPLES, FEATURES
 from tests.run.conftest import TALKER
 from tests.run.test_recorded_order import ALL, MIXED
@@ -163,6 +166,31 @@ def test_what_waiting_callbacks_with_execution_times_send(
     )
     assert run(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap").error is None
     unchanged(tmp_path / "run.mcap", tmp_path)
+    if "/asker" in times and not more:
+        said_is_heard_when_it_left(tmp_path / "run.mcap")
+
+
+def said_is_heard_when_it_left(path: Path) -> None:
+    """The echo takes no time and links none, so what left is received at that time."""
+    with Trace.open(path) as trace:
+        (said,) = (one for one in trace.entities.values() if (one.name, one.kind) == SAID)
+        (heard,) = (one for one in trace.entities.values() if (one.name, one.kind) == HEARD)
+        history = RunHistory(trace)
+        messages = history.messages([said], heard.id)
+        assert {one.left_ns - one.sent_ns for one in messages} == {0, 1_000_000}
+        for one in messages:
+            assert one.taken is None or history.stamp(one.taken) == one.left_ns
+        flow = MessageFlow(trace, ChainSelection())
+        for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
+            flow.read(events, outputs)
+        left_ns = flow.messages["published"]
+        taken = zip(flow.taken["message"], flow.taken["began"], strict=True)
+        received = [(began_ns, left_ns[message]) for message, began_ns in taken]
+        assert received
+        assert all(began_ns == sent_ns for began_ns, sent_ns in received)
+
+
+SAID, HEARD = ("/said", EntityKind.PUBLISHER), ("/said", EntityKind.SUBSCRIPTION)
 
 
 @pytest.mark.long

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from rsltrace.checks.latency.paths import NO_PATH, ChainPaths, ChainSelection, Hop, sink_hop
 from rsltrace.errors import TraceError
+from rsltrace.trace.departures import Departures
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,
@@ -152,7 +153,8 @@ class MessageFlow:
         self._observed = native_times(trace)
         self._delays = IntegerTable("message", "entity", "delay")
         self._of_events = IntegerTable("event", "taken")
-        self._suspended: dict[int, deque[tuple[int, int]]] = {}
+        self._suspended: dict[int, deque[int]] = {}
+        self._departures = Departures()
         self._last: dict[str, dict[str, int]] = {node: {} for node in wanted.via}
         self._hops: dict[int, int] = {}
         self._nodes: dict[int, str] = {}
@@ -215,8 +217,11 @@ class MessageFlow:
         fields = ("index", "stamp", "entity", "kind", "flags", "cause_event", "cause_output")
         columns = [events[name][chosen].tolist() for name in fields]
         rows = zip(*columns, pairwise(bounds), strict=True)
+        late_ns = self._departures.read(first, events, outputs)
         for index, stamp, entity, kind, flags, cause, nth, (low, high) in rows:
-            self._event(index, stamp, entity, kind, flags, (cause, nth), selected[low:high])
+            sent = selected[low:high]
+            late = late_ns.get(index, 0)
+            self._event(index, stamp, entity, kind, flags, (cause, nth), sent, late)
 
     def _event(
         self,
@@ -227,10 +232,10 @@ class MessageFlow:
         flags: int,
         cause: tuple[int, int],
         outputs: list[_Selected],
+        late_ns: int,
     ) -> None:
-        taken, busy_ns = self._came_of(index, stamp_ns, entity, kind, cause)
-        if self._observed is not None:
-            busy_ns = self._observed.durations[index]
+        taken = self._came_of(index, stamp_ns, entity, kind, cause)
+        busy_ns = late_ns if self._observed is None else self._observed.durations[index]
         if taken != NONE:
             self._of_events.add(index, taken)
         if kind == _SUBSCRIPTION and (received := self._last.get(self.node_of(entity))) is not None:
@@ -246,9 +251,7 @@ class MessageFlow:
                 follows = place
                 continue
             draw, value_ns = number >> _KIND_BITS, number & _VALUE
-            if draw == RandomDecision.EXECUTION and sender == entity:
-                busy_ns = value_ns
-            elif row != NONE and place == follows + 1:
+            if row != NONE and place == follows + 1:
                 follows = place
                 if draw == RandomDecision.DELAY:
                     self._delays.add(row, sender, value_ns)
@@ -258,7 +261,7 @@ class MessageFlow:
         if self.sink is not None and done and taken != NONE and self.node_of(entity) == self.sink:
             self._end(index, stamp_ns, stamp_ns + busy_ns, taken)
         if flags & _SUSPENDED:
-            self._suspended.setdefault(entity, deque()).append((taken, busy_ns))
+            self._suspended.setdefault(entity, deque()).append(taken)
 
     def _end(self, index: int, began_ns: int, done_ns: int, taken: int) -> None:
         """Let the chains end that a callback of the last node has taken a message of."""
@@ -272,20 +275,19 @@ class MessageFlow:
 
     def _came_of(
         self, index: int, stamp_ns: int, entity: int, kind: int, cause: tuple[int, int]
-    ) -> tuple[int, int]:
-        """Return what an event goes on with: how its message was received, and for how much longer
-        than it what it sends is held back."""
+    ) -> int:
+        """Return how the message was received that an event goes on with."""
         inherited = NONE
         if cause[0] < index:
             if (taken := self._receive(index, entity, stamp_ns, cause)) != NONE:
-                return taken, 0
+                return taken
             if kind != _SUBSCRIPTION:
                 inherited = self._of_event(cause[0])
         if kind == _RESUME and (waiting := self._suspended.get(entity)):
-            found = next((one for one in waiting if one[0] == inherited), waiting[0])
+            found = inherited if inherited in waiting else waiting[0]
             waiting.remove(found)
             return found
-        return inherited, 0
+        return inherited
 
     def _of_event(self, event: int) -> int:
         events = self._of_events["event"]
