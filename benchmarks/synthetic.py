@@ -14,9 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rsltrace.trace import segments
 from rsltrace.trace.chain import hash64
-from rsltrace.trace.dtypes import EVENT_DTYPE, EVENT_REST_DTYPE, OUTPUT_DTYPE, SEGMENT_DTYPE
+from rsltrace.trace.dtypes import (
+    EVENT_DTYPE,
+    EVENT_REST_DTYPE,
+    OUTPUT_CONTENT_DTYPE,
+    OUTPUT_DTYPE,
+)
 from rsltrace.trace.format import CDR_HEADER, OUTPUT_HASHED
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind
@@ -35,21 +39,10 @@ class BulkWriter(TraceWriter):
 
     def add_segment(self, events: np.ndarray, outputs: np.ndarray) -> None:
         """Write the next events (EVENT_DTYPE) with their outputs (OUTPUT_DTYPE)."""
-        stream = self._stream
-        outputs_at = stream.chunk(
-            segments.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
-        )
-        row = np.zeros(1, dtype=SEGMENT_DTYPE)
-        row["first_event"], row["events"] = self._events_written, len(events)
-        row["first_output"], row["outputs"] = self._outputs_written, len(outputs)
-        row["chain_hash"] = self._last_chain_hash = int(events["chain_hash"][-1])
-        row["start_stamp"], row["end_stamp"] = events["stamp"].min(), events["stamp"].max()
-        row["outputs_offset"], row["outputs_length"] = outputs_at
-        at = stream.chunk(segments.events_chunk(events, self._event_channel))
-        row["events_offset"], row["events_length"] = at
-        self._segments.append(row.tobytes())
-        self._events_written += len(events)
-        self._outputs_written += len(outputs)
+        contents = np.empty(len(outputs), dtype=OUTPUT_CONTENT_DTYPE)
+        for name in OUTPUT_CONTENT_DTYPE.names or ():
+            contents[name] = outputs[name]
+        self._write_rows(events.tobytes(), contents.tobytes(), outputs["sequence"].tobytes())
 
 
 @dataclass(frozen=True)

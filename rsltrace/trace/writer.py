@@ -418,13 +418,13 @@ class TraceWriter:
         try:
             self._write_entities()
             self._write_payloads()
-            self._write_events_and_outputs()
+            self._write_rows(*self._buffer.rows())
+            self._buffer.clear_rows()
         except BaseException:
             self._stream.poison()
             raise
 
-    def _write_events_and_outputs(self) -> None:
-        rows, contents, sequences = self._buffer.rows()
+    def _write_rows(self, rows: bytes, contents: bytes, sequences: bytes) -> None:
         events = np.frombuffer(rows, dtype=EVENT_DTYPE)
         self._check(events)
         count, outputs_at = int(events["outputs"].sum()), (0, 0)
@@ -444,7 +444,6 @@ class TraceWriter:
         self._last_chain_hash = int(events["chain_hash"][-1])
         self._events_written += len(events)
         self._outputs_written += count
-        self._buffer.clear_rows()
 
     def _check(self, events: npt.NDArray[np.void]) -> None:
         """Stop at once if the recorder miscounts: such a trace would mislead."""
