@@ -107,6 +107,8 @@ class Server(Node):
 
     def on_goal(self, goal: Any) -> Fibonacci.Result:
         goal.publish_feedback(Fibonacci.Feedback(sequence=[1]))
+        # rclpy's client, on threads, ignores a result that comes before its request is noted.
+        time.sleep(0.05)
         goal.succeed()
         return Fibonacci.Result(sequence=[1, 1, 2])
 
