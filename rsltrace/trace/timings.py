@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.trace.dtypes import TIMING_DTYPE
+from rsltrace.trace.dtypes import EVENT_DTYPE, TIMING_DTYPE
 from rsltrace.trace.format import CDR_HEADER, TIMING, TOPIC_TIMINGS
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT
@@ -139,7 +139,7 @@ def event_columns(trace: Trace) -> npt.NDArray[np.void]:
     """Return the columns of all events that say what ran when, and why."""
     names = ["stamp", "entity", "kind", "flags", "cause_event", "cause_output", "outputs"]
     parts = [events[names] for events in trace.events()]
-    return np.concatenate(parts) if parts else np.zeros(0, [(n, np.uint64) for n in names])
+    return np.concatenate(parts) if parts else np.zeros(0, EVENT_DTYPE)[names]
 
 
 def senders_of(trace: Trace, events: npt.NDArray[np.void]) -> npt.NDArray[np.int64]:

@@ -167,3 +167,15 @@ def test_an_action_is_found_by_its_name_and_counted_by_its_goals(
     assert asked.returncode == 2
     assert "name a topic or callback of /asks; there are" in asked.stderr
     assert ", Asks.tick" in asked.stderr
+
+
+def test_of_a_run_that_was_cut_before_its_first_event_nothing_ran(
+    tmp_path: Path, command: Callable[..., CompletedProcess[str]]
+) -> None:
+    whole = Path(__file__).parents[2].joinpath("sample_traces/missing_event/b.mcap").read_bytes()
+    for kept in range(0, len(whole), 500):
+        (tmp_path / "cut.mcap").write_bytes(whole[:kept])
+        asked = command("why", "cut.mcap", "/picker", "/close")
+        if asked.returncode != 2:  # the first cut with the graph, and yet without an event
+            break
+    assert "client /close of /picker has sent nothing (picker.py:" in asked.stdout
