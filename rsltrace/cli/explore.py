@@ -461,11 +461,9 @@ class _SearchReport:
 
         source, search = self._source, self._search
         explored = Exploration(
-            source.path,
+            source,
             list(result_rows(self._folder)),
             strategy=self._strategy,
-            arguments=[word for _, text in source.overrides for word in ("--set", text)],
-            begins_recorded=source.begins_recorded,
             coverage=search.strategy.coverage(),
             wall_s=time.monotonic() - search.began_s,
             reduced={

@@ -39,8 +39,9 @@ def test_a_failing_order_is_found_and_repeated_by_the_command_that_is_printed(
     found = [one for one in result_rows(folder) if one.failure is not None]
     assert found[0].failure.key == "the second comes last"
     again = shlex.split(re.search(r"reproduce: rsltrace (.*)", done.stdout)[1])
-    repeated = command(*again, "-q", "-o", tmp_path / "again.mcap")
-    assert repeated.returncode == 1
+    (tmp_path / "found.mcap").touch()
+    repeated = command(*again)
+    assert repeated.returncode == 1, repeated.stderr
     assert f"digest {found[0].digest}  events {found[0].events}" in repeated.stdout
     assert Path(found[0].trace).is_file()
     assert found[0].metrics == {"said": 2.0}

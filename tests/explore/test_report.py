@@ -21,7 +21,7 @@ from rsltrace.search.explore.report.exploration import (
     repeat_command,
 )
 from rsltrace.search.explore.report.formats import github_text, json_values, junit_text
-from rsltrace.search.explore.trial import CHECK, EXCEPTION, Failure, Trial, TrialResult
+from rsltrace.search.explore.trial import CHECK, EXCEPTION, Failure, JobSource, Trial, TrialResult
 
 LATE = Failure(CHECK, "it is <late> & wrong\x1b[2J", "never /late", 41)
 RAISED = Failure(EXCEPTION, "raised KeyError", "KeyError at nodes.py:12", 7)
@@ -48,7 +48,7 @@ def explored(count: int = 300) -> Exploration:
             )
         )
     return Exploration(
-        "robot/job.yaml",
+        JobSource("robot/job.yaml"),
         results,
         strategy="mixed",
         coverage=["Every order of up to 2 departures was tried."],
@@ -149,7 +149,7 @@ def test_the_page_needs_nothing_beside_it_and_nobodys_text_is_markup() -> None:
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_page_of_next_to_nothing(count: int) -> None:
     seen = _Balanced()
-    seen.feed(exploration_page(Exploration("job.yaml", explored(count).results)))
+    seen.feed(exploration_page(Exploration(JobSource("job.yaml"), explored(count).results)))
     assert seen.open == []
     assert f"None of the {count} runs failed" in seen.text
 
@@ -172,7 +172,7 @@ def test_formats_for_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     assert late.startswith("::error file=robot/job.yaml,title=check%3A never /late::")
     assert "%0A" in late
     assert raised.startswith("::error file=robot/nodes.py,line=12,title=")
-    kept = Exploration("job.yaml", [TrialResult(Trial(0, {}))])
+    kept = Exploration(JobSource("job.yaml"), [TrialResult(Trial(0, {}))])
     assert ElementTree.fromstring(junit_text(kept)).attrib["failures"] == "0"
     assert github_text(kept).startswith("::notice file=job.yaml::1 runs, none failed; the job has ")
 
@@ -180,7 +180,7 @@ def test_formats_for_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
 def test_a_job_without_checks_is_told_what_was_not_looked_for() -> None:
     result = TrialResult(Trial(0, {}), digest="1")
     for checks, said in ((0, True), (2, False)):
-        found = Exploration("job.yaml", [result], checks=checks)
+        found = Exploration(JobSource("job.yaml"), [result], checks=checks)
         for text in (
             exploration_page(found),
             json.dumps(json_values(found)),
@@ -193,10 +193,15 @@ def test_a_job_without_checks_is_told_what_was_not_looked_for() -> None:
 
 def test_a_command_that_nobody_can_read_is_not_shown() -> None:
     one = TrialResult(Trial(1, {"seed": 4, "policy": {"departures": [{"choice": 2, "run": 1}]}}))
-    found = Exploration("my job.yaml", [one])
+    found = Exploration(JobSource("my job.yaml"), [one])
     shown = repeat_command(found, one)
     assert shown is not None
-    assert shown.startswith("rsltrace record 'my job.yaml' --seed 4 --set 'policy=")
+    assert shown.startswith("rsltrace record 'my job.yaml' --set seed=4 --set 'policy=")
+    program = (("nodes.+", 'nodes.+={"script": "a.py"}'),)
+    found = Exploration(JobSource("<command line>", program, "nodes: []"), [one])
+    shown = repeat_command(found, one)
+    assert shown is not None
+    assert shown.startswith("rsltrace record --set 'nodes.+={")
     many = [{"choice": number, "run": 1} for number in range(100)]
     assert repeat_command(found, TrialResult(Trial(1, {"policy": {"departures": many}}))) is None
 
@@ -208,9 +213,9 @@ def test_a_table_can_be_queried_and_merged_with_another(tmp_path: Path) -> None:
     for name in "ab":
         (tmp_path / name).mkdir()
         write_parquet(explored(), tmp_path / name / "results.parquet")
-    write_parquet(Exploration("job.yaml", []), tmp_path / "empty.parquet")
+    write_parquet(Exploration(JobSource("job.yaml"), []), tmp_path / "empty.parquet")
     other = TrialResult(Trial(0, {"set": {"colour": 3.0, "load": "high"}}), metrics={"time": 2.0})
-    write_parquet(Exploration("job.yaml", [other]), tmp_path / "b" / "more.parquet")
+    write_parquet(Exploration(JobSource("job.yaml"), [other]), tmp_path / "b" / "more.parquet")
     assert sorted(path.name for path in tmp_path.rglob(".*")) == []
     both = f"read_parquet('{tmp_path}/*/*.parquet', union_by_name=true)"
     runs, failed = duckdb.sql(

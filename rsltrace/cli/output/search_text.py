@@ -213,17 +213,7 @@ def _cause(result: TrialResult, count: int, source: JobSource) -> Iterator[str]:
     if result.trace is not None and Path(result.trace).is_file():
         at = f" --at {failure.event}" if failure.event is not None else ""
         yield f"  view: rsltrace view {shlex.quote(result.trace)}{at}"
-    yield f"  reproduce: {repeats(result, source)}"
-
-
-def repeats(result: TrialResult, source: JobSource) -> str:
-    """Return the command that reproduces the run of a trial."""
-    words = ["rsltrace", "record"]
-    if source.text is None:
-        words.append(source.path)
-    for _, text in (*source.overrides, *source.overrides_of(result.trial)):
-        words += ["--set", text]
-    return shlex.join(words)
+    yield f"  reproduce: {source.command(trial)}"
 
 
 def _counted(count: int, what: str) -> str:

@@ -13,6 +13,7 @@ that repeats a trial: ``rsltrace record`` of that file has its digest.
 from __future__ import annotations
 
 import json
+import shlex
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -77,6 +78,13 @@ class JobSource:
         if self.text is not None:
             return job_from_text(self.text, self.path, self.folder, overrides=overrides)
         return load_job(self.path, overrides=overrides)
+
+    def command(self, trial: Trial) -> str:
+        """Return the command that runs a trial again, whatever was recorded before."""
+        words = ["rsltrace", "record", *([self.path] if self.text is None else [])]
+        for _, text in (*self.overrides, *self.overrides_of(trial)):
+            words += ["--set", text]
+        return shlex.join([*words, "-o", "found.mcap", "--force"])
 
     def overrides_of(self, trial: Trial) -> Iterator[tuple[str, str]]:
         """Yield the overlay of a trial as overrides of this job: (name for messages, text)."""

@@ -37,22 +37,23 @@ class ReducedRun:
 class Exploration:
     """A search that has ended.
 
-    ``job`` is the job file as it was named, ``arguments`` what else names the job in a command
-    (``--set``, ``--launch``), ``begins_recorded`` as for ``JobSource``. ``coverage`` are sentences
-    on what was tried, ``units`` the units of metrics, ``reduced`` the reduced runs by their
-    failure's key, ``checks`` the number of checks.
+    ``coverage`` are sentences on what was tried, ``units`` the units of metrics, ``reduced`` the
+    reduced runs by their failure's key, ``checks`` the number of checks.
     """
 
-    job: str
+    source: JobSource
     results: Sequence[TrialResult]
     strategy: str = ""
-    arguments: Sequence[str] = ()
-    begins_recorded: bool = False
     coverage: Sequence[str] = ()
     wall_s: float = 0.0
     units: Mapping[str, str] = field(default_factory=dict)
     reduced: Mapping[str, ReducedRun] = field(default_factory=dict)
     checks: int = 0
+
+    @property
+    def job(self) -> str:
+        """The job file as it was named."""
+        return self.source.path
 
     @property
     def caution(self) -> str:
@@ -137,15 +138,7 @@ def _fault(fault: Mapping[str, Any]) -> str:
 
 def repeat_command(explored: Exploration, result: TrialResult) -> str | None:
     """Return the command that repeats a run, None if it would be too long to read."""
-    words = ["rsltrace", "record", explored.job, *explored.arguments]
-    source = JobSource(explored.job, begins_recorded=explored.begins_recorded)
-    for _, override in source.overrides_of(result.trial):
-        path, _, value = override.partition("=")
-        if path == "seed":
-            words += ["--seed", value]
-        else:
-            words += ["--set", override]
-    command = shlex.join(words)
+    command = explored.source.command(result.trial)
     return command if len(command) <= _COMMAND_MAX else None
 
 
