@@ -206,7 +206,7 @@ class JobPart(Fielded):
         values: dict[str, object] = {}
         for name, field in type(self).model_fields.items():
             key = field.alias or name
-            if key not in changes and name not in changes and name in self.model_fields_set:
+            if key not in changes and name not in changes and name in self._given:
                 value = getattr(self, name)
                 values[key] = _counted(value) if self.counts_ns(name) else value
         return type(self)(**values, **changes)
