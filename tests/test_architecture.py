@@ -45,7 +45,7 @@ def test_help_and_version_load_nothing_heavy() -> None:
     [
         ("rsltrace.simulation.loop.loop", set()),
         ("rsltrace.trace.model.event", set()),
-        ("rsltrace.job", {"pydantic", "ruamel"}),
+        ("rsltrace.job", {"ruamel"}),
         ("rsltrace.trace.reader", set()),
         ("rsltrace.trace.writer", {"numpy"}),
     ],

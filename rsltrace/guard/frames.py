@@ -86,20 +86,21 @@ def replace_special_method(
         replace_member(stack, kind, name, lambda member: staticmethod(made))
     else:
         replace_member(stack, kind, name, make)
-    for one in _subclasses_of(kind):
-        if _slot(one, name).value == slot:
-            _set_slot(stack, one, name, by_name)
+    inheriting = [one for one in _subclasses_of(kind) if _slot(one, name).value == slot]
+    _set_slots(stack, inheriting, name, by_name)
     if name == "__init__" and _slot(_HasNone, "vectorcall").value is None:
-        _set_slot(stack, kind, "vectorcall", None)  # which makes an object without it
+        _set_slots(stack, [kind], "vectorcall", None)  # which makes an object without it
 
 
-def _set_slot(stack: ExitStack, kind: type, name: str, value: int | None) -> None:
-    stack.callback(_write_slot, kind, name, _slot(kind, name).value)  # which keeps the type, too
-    _write_slot(kind, name, value)
+def _set_slots(stack: ExitStack, kinds: list[type], name: str, value: int | None) -> None:
+    """Set a slot, which is the same in all of these types, until ``stack`` ends."""
+    stack.callback(_write_slots, kinds, name, _slot(kinds[0], name).value)  # which keeps them, too
+    _write_slots(kinds, name, value)
 
 
-def _write_slot(kind: type, name: str, value: int | None) -> None:
-    _slot(kind, name).value = value
+def _write_slots(kinds: list[type], name: str, value: int | None) -> None:
+    for kind in kinds:
+        _slot(kind, name).value = value
 
 
 def _subclasses_of(kind: type) -> set[type]:

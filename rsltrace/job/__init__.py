@@ -1,6 +1,6 @@
 """What a run is to do: job files and jobs built in Python, strictly validated, never executed.
 
-The names are loaded when first used: ``values.times`` serves those who need no pydantic.
+The names are loaded when first used: ``values.times`` serves those who need no part of a job.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def _explicit(part: JobPart) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, field in type(part).model_fields.items():
         value = getattr(part, name)
-        if field.exclude or value == field.get_default(call_default_factory=True):
+        if field.exclude or value == field.get_default():
             continue
         key = field.alias or name
         values[key] = _times(value) if part.counts_ns(name) else _plain(value, _explicit)

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
-
+from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.keys import later
 from rsltrace.job.parts.node import NodeSpec
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from rsltrace.job.parts.scheduling import ExecutionSpec, ExecutorSpec, PolicySpec, ThreadsSpec
     from rsltrace.job.parts.vary import VarySpec
 else:
-    # What most jobs do without: importing all parts takes as long as importing pydantic.
+    # What most jobs do without: importing all parts takes as long as reading a job.
     _PARTS = "rsltrace.job.parts."
     globals().update(
         later(f"{_PARTS}bag", "BagSpec")

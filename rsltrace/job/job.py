@@ -6,12 +6,11 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from pydantic import model_validator
-
 from rsltrace.errors import did_you_mean
 from rsltrace.job.dump import job_resolved, job_yaml
 from rsltrace.job.fields import JobFields
 from rsltrace.job.parts.node import NodeSpec
+from rsltrace.job.parts.part import after_fields
 from rsltrace.job.parts.stop import StopSpec
 from rsltrace.job.values.mappings import near_path
 from rsltrace.job.values.problem import JobProblem, JobProblems
@@ -282,9 +281,8 @@ class Job(JobFields):
         sheet.text(self.to_yaml(), summary="as YAML")
         return sheet.html()
 
-    @model_validator(mode="after")
-    def _check_whole(self) -> Job:
+    @after_fields
+    def _check_whole(self) -> None:
         problems = list(contradictions(self))
         if problems:
             raise JobProblems(problems)
-        return self

@@ -345,9 +345,7 @@ def job_of_native(trace: Trace, job: Job) -> Job:
         spec if any(getattr(spec, key) for key in _ONLY_OF_PROCESSES) else as_python(job, spec)
         for spec in job.nodes
     )
-    defaults = {
-        key: Job.model_fields[key].get_default(call_default_factory=True) for key in _OF_SIMULATIONS
-    }
+    defaults = {key: Job.model_fields[key].get_default() for key in _OF_SIMULATIONS}
     lasted_ns = last_ns(trace) - trace.start_ns
     return job.model_copy(
         update={

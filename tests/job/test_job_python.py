@@ -1,5 +1,5 @@
 # ruff: noqa: E501  the table of messages reads better in one line each
-"""Jobs built in Python: the same checks, with ``JobError`` instead of pydantic's error."""
+"""Jobs built in Python: the same checks, which raise ``JobError``."""
 
 from __future__ import annotations
 

@@ -7,20 +7,19 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
 
 import jsonschema
 import pytest
-from pydantic import BaseModel, TypeAdapter
-from pydantic.fields import FieldInfo
 from ruamel.yaml import YAML
 
 from rsltrace.job.documents.reference import reference, undocumented
 from rsltrace.job.documents.schema import field_schema, job_schema
 from rsltrace.job.job import Job
+from rsltrace.job.parts.field import Fielded, FieldInfo
 from rsltrace.job.parts.keys import file_fields, models_in
+from rsltrace.job.parts.part import checked
 from rsltrace.job.reading.compose import CompositionKeys
-from rsltrace.job.values.checks import FROM_FILE
+from rsltrace.job.values.problem import JobProblem
 
 ROOT = Path(__file__).parents[2]
 JOBS = sorted([*ROOT.glob("examples/*/*job*.yaml"), *ROOT.glob("sample_traces/*/*job*.yaml")])
@@ -87,7 +86,7 @@ def test_what_the_loader_refuses_does_not_fit(text: str) -> None:
 
 
 def fields() -> Iterator[tuple[str, FieldInfo]]:
-    models: list[type[BaseModel]] = [Job, CompositionKeys]
+    models: list[type[Fielded]] = [Job, CompositionKeys]
     for model in models:
         for key, field in file_fields(model):
             yield f"{model.__name__}.{key}", field
@@ -103,10 +102,16 @@ def test_examples_are_right(name: str) -> None:
     schema = field_schema(field)
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator({**schema, "$defs": SCHEMA["$defs"]})
-    annotation: Any = Annotated[(field.annotation, *field.metadata, field.description)]
-    for example in field.examples or []:
-        TypeAdapter(annotation).validate_python(example, context=FROM_FILE)
+    found: list[JobProblem] = []
+    for example in field.examples:
+        checked(field, example, found, (), in_file=True)
         validator.validate(example)
+    assert found == []
+
+
+def test_every_key_is_checked() -> None:
+    unchecked = [name for name, field in FIELDS.items() if not field.metadata]
+    assert [name for name in unchecked if not models_in(FIELDS[name].annotation)] == []
 
 
 def test_every_key_is_described_and_has_an_example() -> None:

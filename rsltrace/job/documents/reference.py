@@ -12,12 +12,11 @@ from collections.abc import Iterator
 from io import StringIO
 from typing import Any
 
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 from ruamel.yaml import YAML
 
 from rsltrace.job.documents.schema import field_schema, file_default, summary
 from rsltrace.job.job import Job
+from rsltrace.job.parts.field import Fielded, FieldInfo
 from rsltrace.job.parts.keys import attached, file_fields, models_in
 from rsltrace.job.reading.compose import CompositionKeys
 from rsltrace.job.values.times import TIME_SCHEMA
@@ -54,7 +53,7 @@ A type is named only where the example does not show it.
 def reference() -> str:
     """Return the text of ``docs/jobs.md``."""
     out = [_HEAD]
-    done: dict[type[BaseModel], str] = {}
+    done: dict[type[Fielded], str] = {}
     out += _section("The job", None, [*file_fields(Job), *file_fields(CompositionKeys)], done)
     queue = list(_parts([*file_fields(Job)], ""))
     while queue:
@@ -71,7 +70,7 @@ def reference() -> str:
 def undocumented() -> list[str]:
     """Return the keys whose fields lack a description or an example."""
     missing, done = [], set()
-    queue: list[type[BaseModel]] = [Job, CompositionKeys]
+    queue: list[type[Fielded]] = [Job, CompositionKeys]
     while queue:
         model = queue.pop()
         done.add(model)
@@ -82,7 +81,7 @@ def undocumented() -> list[str]:
     return missing
 
 
-def _parts(fields: list[tuple[str, FieldInfo]], path: str) -> Iterator[tuple[str, type[BaseModel]]]:
+def _parts(fields: list[tuple[str, FieldInfo]], path: str) -> Iterator[tuple[str, type[Fielded]]]:
     for key, field in fields:
         inner = f"{path}.{key}" if path else key
         kind = field_schema(field).get("type")
@@ -96,9 +95,9 @@ def _parts(fields: list[tuple[str, FieldInfo]], path: str) -> Iterator[tuple[str
 
 def _section(
     title: str,
-    model: type[BaseModel] | None,
+    model: type[Fielded] | None,
     fields: list[tuple[str, FieldInfo]],
-    done: dict[type[BaseModel], str],
+    done: dict[type[Fielded], str],
 ) -> list[str]:
     """Return a section. Keys of a base class that has a section, in ``done``, are not repeated."""
     out = [f"## {title}", ""]
@@ -116,7 +115,7 @@ def _section(
     return [*out, ""] if fields else out
 
 
-def _extends(model: type[BaseModel], other: type[BaseModel]) -> bool:
+def _extends(model: type[Fielded], other: type[Fielded]) -> bool:
     """Whether a model has all keys of another, or only such keys."""
     return issubclass(model, other) or issubclass(other, model)
 

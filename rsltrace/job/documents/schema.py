@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import inspect
 import types
+from collections.abc import Sequence
 from itertools import combinations
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
-
 from rsltrace.job.job import Job
+from rsltrace.job.parts.field import Fielded, FieldInfo
 from rsltrace.job.parts.keys import attached, file_fields, model_of
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.reading.compose import CompositionKeys
@@ -70,7 +69,7 @@ def file_default(field: FieldInfo) -> Any:
     """Return the default of a field as a job file would say it, or None."""
     if field.is_required():
         return None
-    value = field.get_default(call_default_factory=True)
+    value = field.get_default()
     if type(value) is int and attached(field, "schema") is TIME_SCHEMA:
         return format_time(value)
     return _plain(value)
@@ -91,7 +90,7 @@ class _Maker:
         self._definitions = definitions
         self._partial = partial
 
-    def reference(self, model: type[BaseModel]) -> Schema:
+    def reference(self, model: type[Fielded]) -> Schema:
         """Return a reference to a part's definition, which is made if need be."""
         name = model.__name__.removesuffix("Spec") + ("Change" if self._partial else "")
         if name not in self._definitions:
@@ -99,7 +98,7 @@ class _Maker:
             self._definitions[name] = self._definition(model)
         return {"$ref": f"#/$defs/{name}"}
 
-    def _definition(self, model: type[BaseModel]) -> Schema:
+    def _definition(self, model: type[Fielded]) -> Schema:
         fields = dict(file_fields(model))
         if model is Job:
             fields = {**dict(file_fields(CompositionKeys)), **fields}
@@ -143,7 +142,7 @@ class _Maker:
             annotated["examples"] = list(field.examples)
         return {**annotated, **whole}
 
-    def _of(self, annotation: Any, metadata: list[Any]) -> Schema:
+    def _of(self, annotation: Any, metadata: Sequence[Any]) -> Schema:
         """Return the schema of a type with the checks in its metadata."""
         origin = get_origin(annotation)
         if origin is Annotated:
@@ -151,7 +150,6 @@ class _Maker:
             return self._of(annotation, [*metadata, *more])
         facts: Schema = {}
         for item in metadata:
-            function = getattr(item, "func", None)
             for name in (
                 "schema",
                 "shorthand",
@@ -162,7 +160,7 @@ class _Maker:
                 "or_entry",
                 "names",
             ):
-                value = getattr(function, name, None)
+                value = getattr(item, name, None)
                 if value is not None:
                     facts[name] = value
         if "schema" in facts:
@@ -210,7 +208,7 @@ class _Maker:
         return {"anyOf": [reference, *_options(short)]}
 
 
-def summary(model: type[BaseModel]) -> str:
+def summary(model: type[Fielded]) -> str:
     """Return the first paragraph of a model's docstring."""
     return " ".join(inspect.cleandoc(model.__doc__ or "").split("\n\n")[0].split())
 

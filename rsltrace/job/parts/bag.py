@@ -6,15 +6,13 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator
-
+from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     Globs,
     attach,
     check,
     check_names,
-    from_file,
     number,
     one_of,
     positive_time,
@@ -84,6 +82,12 @@ def _check_loop(value: object) -> bool | int:
 attach(_check_loop, schema={"anyOf": [{"type": "boolean"}, {"type": "integer", "minimum": 1}]})
 
 
+def _not_empty_in_a_file(value: object, in_file: bool) -> object:
+    if not value and in_file:
+        raise JobProblem("an empty list would play nothing: leave the key out to play all topics")
+    return value
+
+
 class BagSpec(JobPart):
     """One entry of ``bags:``.
 
@@ -95,7 +99,7 @@ class BagSpec(JobPart):
         description="The folder, `.mcap` or `.db3` file.",
         examples=["../bags/outdoor"],
     )
-    topics: Globs = Field(
+    topics: Annotated[Globs, _not_empty_in_a_file] = Field(
         default=(),
         description="Topics to play, as globs. Default: all.",
         examples=[["/imu/*", "/odom"]],
@@ -172,12 +176,3 @@ class BagSpec(JobPart):
             remappings: dict[str, str] = ...,
             qos: dict[str, QosSpec | dict[str, Any]] = ...,
         ) -> None: ...
-
-    @field_validator("topics")
-    @classmethod
-    def _not_empty_in_a_file(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
-        if not value and from_file(info):
-            raise JobProblem(
-                "an empty list would play nothing: leave the key out to play all topics"
-            )
-        return value

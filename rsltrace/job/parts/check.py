@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, model_validator
-
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import (
     attach,
     check,
@@ -71,8 +70,8 @@ class LatencySpec(JobPart):
         )
     )
 
-    @model_validator(mode="after")
-    def _says_which_chain(self) -> LatencySpec:
+    @after_fields
+    def _says_which_chain(self) -> None:
         if self.chain and (self.start is not None or self.end is not None):
             raise JobProblem("give either chain, or from and to", ("chain",))
         if not self.chain and (self.start is None or self.end is None):
@@ -81,7 +80,6 @@ class LatencySpec(JobPart):
             raise JobProblem("a chain has two topics at least", ("chain",))
         if self.start is not None and self.start == self.end:
             raise JobProblem("from and to are the same topic; give a loop as a chain", ("to",))
-        return self
 
     @property
     def wanted(self) -> dict[str, Any]:
@@ -112,11 +110,10 @@ class MetricSpec(JobPart):
         default=None, description="Unit, for reports.", examples=["m"]
     )
 
-    @model_validator(mode="after")
-    def _says_one_thing(self) -> MetricSpec:
+    @after_fields
+    def _says_one_thing(self) -> None:
         if (self.expression is None) == (self.function is None):
             raise JobProblem("give expression or function")
-        return self
 
 
 _RATE = re.compile(r"\s*(\S+?)\s*[Hh][Zz]\s*")
@@ -246,8 +243,8 @@ class CheckSpec(JobPart):
         """The one of ``KINDS`` that is given."""
         return next(kind for kind in self.KINDS if getattr(self, kind) is not None)
 
-    @model_validator(mode="after")
-    def _says_one_thing(self) -> CheckSpec:
+    @after_fields
+    def _says_one_thing(self) -> None:
         given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
         if len(given) != 1:
             what = f"{' and '.join(given)} are given" if given else "none is given"
@@ -263,4 +260,3 @@ class CheckSpec(JobPart):
                 if getattr(self, key) is not None and kind not in kinds:
                     named = key.removesuffix("_ns")
                     raise JobProblem(f"{named} is for {', '.join(kinds)}, not for {kind}", (named,))
-        return self

@@ -6,9 +6,8 @@ import re
 from fractions import Fraction
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, model_validator
-
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import (
     attach,
     check,
@@ -137,12 +136,11 @@ class ClockSpec(JobPart):
         examples=[{"every": "10s", "most": "50ms"}],
     )
 
-    @model_validator(mode="after")
-    def _jumps_in_order(self) -> ClockSpec:
+    @after_fields
+    def _jumps_in_order(self) -> None:
         for index in range(1, len(self.jumps)):
             if self.jumps[index].at_ns < self.jumps[index - 1].at_ns:
                 raise JobProblem("it is before the jump above", ("jumps", index, "at"))
-        return self
 
     def drift(self) -> Fraction:
         """The drift as an exact fraction."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from pydantic import Field, model_validator
-
 from rsltrace.job.parts.distribution import DistributionSpec
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import (
     check,
+    flag,
     given,
     named_parts,
     number,
@@ -66,7 +66,7 @@ class DelaySpec(DistributionSpec):
         description="Probability that a message arrives twice.",
         examples=[0.001],
     )
-    keep_order: bool = Field(
+    keep_order: Annotated[bool, check(flag)] = Field(
         default=True,
         description="Whether messages of a link stay in order.",
         examples=[False],
@@ -115,15 +115,14 @@ class OutageSpec(JobPart):
         alias="to", description="End, since the start.", examples=["12s"]
     )
 
-    @model_validator(mode="after")
-    def _one_thing(self) -> OutageSpec:
+    @after_fields
+    def _one_thing(self) -> None:
         if sum(name is not None for name in (self.topic, self.service, self.node)) != 1:
             raise JobProblem("give one of topic, service or node")
         if self.to_ns < self.from_ns:
             raise JobProblem("the outage ends before it begins", ("to",))
         if self.to_ns == self.from_ns:
             raise JobProblem("the outage ends when it begins: 'to' has to be later", ("to",))
-        return self
 
     @property
     def what(self) -> tuple[str, str]:
@@ -172,10 +171,9 @@ class DelaysSpec(JobPart):
         examples=["delays.csv"],
     )
 
-    @model_validator(mode="after")
-    def _answered_once(self) -> DelaysSpec:
+    @after_fields
+    def _answered_once(self) -> None:
         for name, model in self.services.items():
             if model.duplicate:
                 place = ("services", name, "duplicate")
                 raise JobProblem("requests and responses of services never arrive twice", place)
-        return self

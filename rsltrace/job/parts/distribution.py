@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from pydantic import Field, model_validator
-
-from rsltrace.job.parts.part import JobPart
-from rsltrace.job.values.checks import attach, check, given, items, number, one_of, positive_time
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
+from rsltrace.job.values.checks import (
+    attach,
+    check,
+    flag,
+    given,
+    items,
+    number,
+    one_of,
+    positive_time,
+)
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.times import TIME_SCHEMA, UNITS_NS, parse_time
@@ -43,11 +51,10 @@ class UniformSpec(JobPart):
         alias="max", description="Longest time.", examples=["3ms"]
     )
 
-    @model_validator(mode="after")
-    def _in_order(self) -> UniformSpec:
+    @after_fields
+    def _in_order(self) -> None:
         if self.max_ns < self.min_ns:
             raise JobProblem("max is less than min", ("max",))
-        return self
 
 
 class NormalSpec(JobPart):
@@ -75,14 +82,13 @@ class _ByMeanSpec(JobPart):
         default=None, alias="sd", description="Standard deviation.", examples=["2ms"]
     )
 
-    @model_validator(mode="after")
-    def _one_way(self) -> _ByMeanSpec:
+    @after_fields
+    def _one_way(self) -> None:
         one, other = self.ALTERNATIVES
         fields = type(self).model_fields.items()
         given = {field.alias or name for name, field in fields if getattr(self, name) is not None}
         if given not in (set(one), set(other)):
             raise JobProblem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
-        return self
 
 
 class LognormalSpec(_ByMeanSpec):
@@ -136,13 +142,12 @@ class SamplesSpec(JobPart):
         examples=["ms"],
     )
 
-    @model_validator(mode="after")
-    def _one_source(self) -> SamplesSpec:
+    @after_fields
+    def _one_source(self) -> None:
         if (self.values_ns is None) == (self.file is None):
             raise JobProblem("give either values or a file")
         if self.values_ns == ():
             raise JobProblem("an empty list has nothing to draw from", ("values",))
-        return self
 
 
 class EmpiricalSpec(JobPart):
@@ -164,8 +169,8 @@ class EmpiricalSpec(JobPart):
         )
     )
 
-    @model_validator(mode="after")
-    def _a_table(self) -> EmpiricalSpec:
+    @after_fields
+    def _a_table(self) -> None:
         values, percent = self.values_ns, self.percent
         if len(values) < 2:
             raise JobProblem("a table needs two values at least, the least and the greatest")
@@ -173,7 +178,7 @@ class EmpiricalSpec(JobPart):
             if values[index] < values[index - 1]:
                 raise JobProblem("it is less than the one before", ("values", index))
         if percent is None:
-            return self
+            return
         if len(percent) != len(values):
             raise JobProblem(f"{len(values)} values need as many, got {len(percent)}", ("percent",))
         for index, expected in ((0, 0), (len(percent) - 1, 100)):
@@ -185,7 +190,6 @@ class EmpiricalSpec(JobPart):
         for index in range(1, len(percent)):
             if percent[index] <= percent[index - 1]:
                 raise JobProblem("it is not more than the one before", ("percent", index))
-        return self
 
 
 def _check_point(value: object) -> tuple[int, int]:
@@ -220,19 +224,18 @@ class SeriesSpec(JobPart):
     unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
         default="s", description="Unit of numbers without one.", examples=["s"]
     )
-    steps: bool = Field(
+    steps: Annotated[bool, check(flag)] = Field(
         default=False,
         description="Hold each value instead of interpolating.",
         examples=[True],
     )
 
-    @model_validator(mode="after")
-    def _one_source(self) -> SeriesSpec:
+    @after_fields
+    def _one_source(self) -> None:
         if (self.points is None) == (self.file is None):
             raise JobProblem("give either points or a file")
         if self.points is not None:
             check_series(self.points)
-        return self
 
 
 def check_series(points: tuple[tuple[int, int], ...]) -> None:
@@ -297,8 +300,8 @@ class DistributionSpec(JobPart):
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple((kind,) for kind in KINDS)
     NEEDS_ONE: ClassVar[bool] = True
 
-    @model_validator(mode="after")
-    def _one_kind(self) -> DistributionSpec:
+    @after_fields
+    def _one_kind(self) -> None:
         given = self.kinds()
         if len(given) > 1:
             raise JobProblem(
@@ -306,7 +309,6 @@ class DistributionSpec(JobPart):
             )
         if not given and self.NEEDS_ONE:
             raise JobProblem(f"give one of {', '.join(self.KINDS)}")
-        return self
 
     def kinds(self) -> list[str]:
         """Return which of ``KINDS`` are given."""

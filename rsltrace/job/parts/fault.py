@@ -6,9 +6,8 @@ import math
 import re
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, model_validator
-
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import check, number, text, whole
 from rsltrace.job.values.names import check_node_glob, check_topic
 from rsltrace.job.values.problem import JobProblem, describe
@@ -254,8 +253,8 @@ class FaultSpec(JobPart):
         """Whether it is about a message that bags play, before it is published."""
         return self.kind in self.OF_BAGS
 
-    @model_validator(mode="after")
-    def _says_one_thing(self) -> FaultSpec:
+    @after_fields
+    def _says_one_thing(self) -> None:
         given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
         if len(given) != 1:
             what = f"{' and '.join(given)} are given" if given else "none is given"
@@ -279,7 +278,6 @@ class FaultSpec(JobPart):
             )
         if self.delay is not None and not self.by_ns:
             raise JobProblem("how late is the message? Give by: 200ms", ("delay",))
-        return self
 
     def _says_what(self) -> None:
         if self.repeat is not None and self.message == 1:

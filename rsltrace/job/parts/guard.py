@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
-
+from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.part import JobPart
-from rsltrace.job.values.checks import attach, check, flag, items, text
+from rsltrace.job.values.checks import Check, attach, check, flag, items, text
 from rsltrace.job.values.problem import JobProblem, as_flag, describe
 from rsltrace.trace.model.finding import (
     DEFAULT_MODES,
@@ -46,7 +45,7 @@ class SourceSpec(JobPart):
         def __init__(self, *, mode: ModeName | None = None, allow: Sequence[str] = ()) -> None: ...
 
 
-def _source(source: NondeterminismSource) -> BeforeValidator:
+def _source(source: NondeterminismSource) -> Check:
     """Prepare one source: its mode as plain text, or a mapping with its mode and exemptions."""
     valid = [mode.value for mode in MODES[source]]
 

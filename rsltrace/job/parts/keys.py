@@ -4,17 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, get_args, get_origin
+from typing import Any, ClassVar, get_args, get_origin
 
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
-from pydantic_core.core_schema import with_info_plain_validator_function
-
+from rsltrace.job.parts.field import Fielded, FieldInfo
 from rsltrace.job.values.problem import Loc
-
-if TYPE_CHECKING:
-    from pydantic import GetCoreSchemaHandler
-    from pydantic_core import CoreSchema
 
 
 class LaterPart:
@@ -23,18 +16,10 @@ class LaterPart:
     HOME: ClassVar[str]
 
     @classmethod
-    def model(cls) -> type[BaseModel]:
+    def model(cls) -> type[Fielded]:
         """Return the part."""
-        found: type[BaseModel] = getattr(import_module(cls.HOME), cls.__name__)
+        found: type[Fielded] = getattr(import_module(cls.HOME), cls.__name__)
         return found
-
-    @classmethod
-    def __get_pydantic_core_schema__(
-        cls, source: object, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        return with_info_plain_validator_function(
-            lambda value, info: cls.model().model_validate(value, context=info.context)
-        )
 
 
 def later(home: str, *names: str) -> dict[str, type[LaterPart]]:
@@ -42,23 +27,23 @@ def later(home: str, *names: str) -> dict[str, type[LaterPart]]:
     return {name: type(name, (LaterPart,), {"HOME": home}) for name in names}
 
 
-def model_of(annotation: Any) -> type[BaseModel] | None:
+def model_of(annotation: Any) -> type[Fielded] | None:
     """Return the model that an annotation is, if it is one."""
     if not isinstance(annotation, type) or get_args(annotation):
         return None  # in Python 3.10 tuple[X, ...] calls itself a type
     if issubclass(annotation, LaterPart):
         return annotation.model()
-    return annotation if issubclass(annotation, BaseModel) else None
+    return annotation if issubclass(annotation, Fielded) else None
 
 
-def file_fields(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
+def file_fields(model: type[Fielded]) -> Iterator[tuple[str, FieldInfo]]:
     """Yield (key in a job file, field) of a model, in order."""
     for name, field in model.model_fields.items():
-        if field.exclude is not True:
+        if not field.exclude:
             yield field.alias or name, field
 
 
-def models_in(annotation: Any) -> list[type[BaseModel]]:
+def models_in(annotation: Any) -> list[type[Fielded]]:
     """Return the models that values of an annotation may be made of."""
     if inner := get_args(annotation):
         return [found for argument in inner for found in models_in(argument)]
@@ -66,7 +51,7 @@ def models_in(annotation: Any) -> list[type[BaseModel]]:
     return [] if model is None else [model]
 
 
-def keys_with(model: type[BaseModel], key: str) -> list[str]:
+def keys_with(model: type[Fielded], key: str) -> list[str]:
     """Return the keys of a model whose parts have a key of that name."""
     return [
         own
@@ -75,7 +60,7 @@ def keys_with(model: type[BaseModel], key: str) -> list[str]:
     ]
 
 
-def field_at(model: type[BaseModel], loc: Loc) -> FieldInfo | None:
+def field_at(model: type[Fielded], loc: Loc) -> FieldInfo | None:
     """Return the field that governs the value at ``loc``, or None below free-form values."""
     models, found = [model], None
     in_mapping = False
@@ -93,7 +78,7 @@ def field_at(model: type[BaseModel], loc: Loc) -> FieldInfo | None:
     return found
 
 
-def alternatives_at(model: type[BaseModel], loc: Loc) -> tuple[tuple[str, ...], ...]:
+def alternatives_at(model: type[Fielded], loc: Loc) -> tuple[tuple[str, ...], ...]:
     """Return the sets of keys of the value at ``loc`` of which only one may be given."""
     field = field_at(model, loc) if loc else None
     models = [] if field is None else models_in(field.annotation)
@@ -101,7 +86,7 @@ def alternatives_at(model: type[BaseModel], loc: Loc) -> tuple[tuple[str, ...], 
 
 
 def without_alternatives(
-    values: dict[Any, Any], keys: Iterable[Any], model: type[BaseModel], loc: Loc
+    values: dict[Any, Any], keys: Iterable[Any], model: type[Fielded], loc: Loc
 ) -> dict[Any, Any]:
     """Return ``values`` without what cannot stay beside the new ``keys``: another distribution
     takes the place of the one that was there."""
@@ -112,7 +97,7 @@ def without_alternatives(
     return {key: value for key, value in values.items() if key not in gone}
 
 
-def is_list_at(model: type[BaseModel], loc: Loc) -> bool:
+def is_list_at(model: type[Fielded], loc: Loc) -> bool:
     """Say whether the value at ``loc`` is a list and nothing else."""
     field = field_at(model, loc) if loc else None
     if field is None or field is field_at(model, loc[:-1]):
@@ -124,13 +109,13 @@ def is_list_at(model: type[BaseModel], loc: Loc) -> bool:
 def attached(field: FieldInfo, name: str) -> Any:
     """Return what a field's check says about itself under ``name``, or None."""
     for item in field.metadata:
-        value = getattr(getattr(item, "func", None), name, None)
+        value = getattr(item, name, None)
         if value is not None:
             return value
     return None
 
 
-def shorthand_at(model: type[BaseModel], loc: Loc) -> str | None:
+def shorthand_at(model: type[Fielded], loc: Loc) -> str | None:
     """Return the key that text alone stands for at ``loc``, if it does."""
     field = field_at(model, loc)
     if field is None or not loc:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, model_validator
-
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import attach, check, flag, text
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_topic
@@ -79,13 +78,12 @@ class StartAfterSpec(JobPart):
     @classmethod
     def after(cls, delay_ns: int) -> StartAfterSpec:
         """Return the rule of an entry that starts ``delay_ns`` after the run."""
-        return cls(delay=f"{delay_ns}ns")  # type: ignore[arg-type]
+        return cls(delay=f"{delay_ns}ns")
 
-    @model_validator(mode="after")
-    def _says_something(self) -> StartAfterSpec:
+    @after_fields
+    def _says_something(self) -> None:
         if not self.model_fields_set:
             raise JobProblem(f"give one of delay, {', '.join(self.CONDITIONS)}")
-        return self
 
 
 def _check_arguments(value: object) -> dict[str, str]:

@@ -7,11 +7,10 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
-
+from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.launch import StartAfterSpec
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.parts.process import InputSpec, RespawnSpec, check_environment, inputs
 from rsltrace.job.values.checks import attach, check, flag, items, one_of, part, text
 from rsltrace.job.values.mappings import check_arguments, check_path, check_remappings
@@ -251,8 +250,8 @@ class NodeSpec(JobPart):
             guard: GuardSpec | dict[str, Any] | bool | None = None,
         ) -> None: ...
 
-    @model_validator(mode="after")
-    def _check_kind(self) -> NodeSpec:
+    @after_fields
+    def _check_kind(self) -> None:
         kinds = [name for name in _KINDS if getattr(self, name) is not None]
         if not kinds:
             raise JobProblem(f"missing key: give one of {_ONE_OF}")
@@ -287,7 +286,6 @@ class NodeSpec(JobPart):
                 f"'{kinds[0]}' takes a list of command-line words: arguments: [--rate, 10]",
                 ("arguments",),
             )
-        return self
 
     def _check_process(self, kind: str) -> None:
         if self.isolated and kind in ("node", "main", "component"):

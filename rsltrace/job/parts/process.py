@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from pydantic import Field, model_validator
-
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import attach, check, flag, is_plain, text, whole
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.problem import JobProblem, ProblemCollector, describe
@@ -63,14 +62,13 @@ class InputSpec(JobPart):
         examples=[True],
     )
 
-    @model_validator(mode="after")
-    def _one(self) -> InputSpec:
+    @after_fields
+    def _one(self) -> None:
         given = [key for key in self.ONE_OF if getattr(self, key) not in (None, False)]
         if len(given) != 1:
             raise JobProblem(f"give one of {', '.join(self.ONE_OF)}")
         if self.keys == "":
             raise JobProblem("no key is given", ("keys",))
-        return self
 
 
 def _inputs(value: object) -> object:
@@ -132,4 +130,4 @@ class RespawnSpec(JobPart):
     @classmethod
     def after(cls, delay_ns: int, times: int | None) -> RespawnSpec:
         """Return the rule by which a process starts again ``delay_ns`` later."""
-        return cls(delay=f"{delay_ns}ns", times=times)  # type: ignore[arg-type]
+        return cls(delay=f"{delay_ns}ns", times=times)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from pydantic import Field, field_validator
-
+from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.part import JobPart
-from rsltrace.job.values.checks import Globs, check, flag, part, positive_time, whole
+from rsltrace.job.values.checks import Globs, attach, check, flag, part, positive_time, whole
 from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_size
@@ -33,6 +32,16 @@ class HooksSpec(JobPart):
     )
 
 
+def _memory(value: object) -> int:
+    size = parse_size(value)
+    if not 1 << 20 <= size <= 1 << 36:
+        raise JobProblem("expected a size from 1MiB to 64GiB")
+    return size // 4096 * 4096
+
+
+attach(_memory, schema=parse_size.schema)  # type: ignore[attr-defined]
+
+
 class LastSpec(JobPart):
     """What a native run keeps in memory of the last seconds."""
 
@@ -41,7 +50,7 @@ class LastSpec(JobPart):
     duration_ns: Annotated[int, check(positive_time)] = Field(
         alias="duration", description="Time to keep.", examples=["30s"]
     )
-    memory: Annotated[int, check(parse_size)] = Field(
+    memory: Annotated[int, check(_memory)] = Field(
         default=64 << 20,
         description="Most memory per process.",
         examples=["64MiB"],
@@ -69,12 +78,11 @@ class LastSpec(JobPart):
             keep_on: Sequence[str] = (),
         ) -> None: ...
 
-    @field_validator("memory")
-    @classmethod
-    def _enough(cls, value: int) -> int:
-        if not 1 << 20 <= value <= 1 << 36:
-            raise JobProblem("expected a size from 1MiB to 64GiB")
-        return value // 4096 * 4096
+
+def _not_empty(value: object, in_file: bool) -> object:
+    if not value:
+        raise JobProblem("an empty list would keep no payload: write 'payloads: false' for that")
+    return value
 
 
 class RecordSpec(JobPart):
@@ -85,7 +93,7 @@ class RecordSpec(JobPart):
         description="Whether to keep messages.",
         examples=[False],
     )
-    topics: Globs = Field(
+    topics: Annotated[Globs, _not_empty] = Field(
         default=("*",),
         description="Topics and services to keep, as globs.",
         examples=[["/odom", "/robot1/*"]],
@@ -117,12 +125,3 @@ class RecordSpec(JobPart):
             segment_events: int = SEGMENT_EVENTS,
             last: LastSpec | TimeLike | None = None,
         ) -> None: ...
-
-    @field_validator("topics")
-    @classmethod
-    def _not_empty(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        if not value:
-            raise JobProblem(
-                "an empty list would keep no payload: write 'payloads: false' for that"
-            )
-        return value

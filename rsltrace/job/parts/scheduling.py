@@ -6,11 +6,10 @@ import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import Field, model_validator
-
 from rsltrace.errors import nearest
 from rsltrace.job.parts.distribution import DistributionSpec
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import check, items, named_parts, one_of, part, parts, text, whole
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_node_glob
@@ -44,11 +43,10 @@ class PriorityRuleSpec(JobPart):
         examples=["/scan"],
     )
 
-    @model_validator(mode="after")
-    def _not_both(self) -> PriorityRuleSpec:
+    @after_fields
+    def _not_both(self) -> None:
         if self.entity is not None and self.group_of is not None:
             raise JobProblem("give entity or group_of, not both", ("group_of",), at_key=True)
-        return self
 
 
 class DepartureSpec(JobPart):
@@ -172,8 +170,8 @@ class PolicySpec(JobPart):
             return False
         return self.order in (None, "fifo") and all(one is None for one in chosen)
 
-    @model_validator(mode="after")
-    def _one(self) -> PolicySpec:
+    @after_fields
+    def _one(self) -> None:
         given = [key for key in self.ONE_OF if getattr(self, key) is not None]
         if self.begins_recorded and len(given) == 2:
             given.remove("recorded")
@@ -192,7 +190,6 @@ class PolicySpec(JobPart):
                     f"choice {departure.choice} is there twice", ("departures", index, "choice")
                 )
             choices.add(departure.choice)
-        return self
 
 
 class ExecutorSpec(JobPart):

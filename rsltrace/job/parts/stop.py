@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from pydantic import Field
-
+from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import check, part, positive_time, text, whole
 from rsltrace.job.values.names import check_field_path, check_topic

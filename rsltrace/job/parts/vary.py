@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
-
-from rsltrace.job.parts.part import JobPart
+from rsltrace.job.parts.field import Field
+from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import attach, check, check_names, one_of, whole
 from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.times import parse_time
@@ -119,8 +118,8 @@ class SettingSpec(JobPart):
         """The one of ``ONE_OF`` that is given."""
         return next(kind for kind in self.ONE_OF if getattr(self, kind) is not None)
 
-    @model_validator(mode="after")
-    def _makes_sense(self) -> SettingSpec:
+    @after_fields
+    def _makes_sense(self) -> None:
         given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
         if len(given) != 1:
             raise JobProblem(f"give one of {', '.join(self.ONE_OF)}, or a list of values")
@@ -128,7 +127,7 @@ class SettingSpec(JobPart):
         if self.steps is not None and kind not in ("uniform", "log_uniform"):
             raise JobProblem(f"steps are for uniform and log_uniform, not for {kind}", ("steps",))
         if self.values is not None:
-            return self
+            return
         first, second = self.bounds
         if kind == "normal":
             if second <= 0:
@@ -141,7 +140,6 @@ class SettingSpec(JobPart):
             pair = self.integers or ()
             if any(is_time(bound) or bound != int(bound) for bound in pair):
                 raise JobProblem("expected two integers, as in [1, 10]", (kind,))
-        return self
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -209,12 +207,12 @@ class VarySpec(JobPart):
             samples: int | None = None,
         ) -> None: ...
 
-    @model_validator(mode="after")
-    def _goes_together(self) -> VarySpec:
+    @after_fields
+    def _goes_together(self) -> None:
         if not self.settings:
             raise JobProblem("nothing varies: name at least one key of the job", ("settings",))
         if self.method != "grid":
-            return self
+            return
         if self.samples is not None:
             raise JobProblem("a grid has as many combinations as it has", ("samples",))
         for name, spec in self.settings.items():
@@ -225,4 +223,3 @@ class VarySpec(JobPart):
                     "a grid has no normal distribution: give a list of values",
                     ("settings", name, spec.kind),
                 )
-        return self

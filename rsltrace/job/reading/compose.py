@@ -13,11 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
-
 from rsltrace.errors import JobError
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.job import Job
+from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.keys import shorthand_at, without_alternatives
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.reading.override import apply_override

@@ -96,7 +96,7 @@ def read_rslcpp(path: Path, name: str) -> dict[str, tuple[int, DelaySpec]]:
             raise ValueError(f"expected FIXED or MEASURED, got {kind!r}")
         if not delay:
             raise ValueError(f"the delay of {topic} in milliseconds is missing")
-        return topic, DelaySpec.model_validate({"constant_ns": _truncated_ms(delay)})
+        return topic, DelaySpec(constant_ns=_truncated_ms(delay))
 
     def header(line: str) -> bool:
         if [column.strip() for column in line.split(",")[1:2]] in (["FIXED"], ["MEASURED"]):

@@ -9,12 +9,9 @@ from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from rsltrace.errors import JobError, nearest
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import file_fields, keys_with
-from rsltrace.job.parts.part import worded_problems
 from rsltrace.job.reading.compose import CompositionKeys, compose
 from rsltrace.job.reading.yaml_source import (
     SourcePlace,
@@ -23,7 +20,6 @@ from rsltrace.job.reading.yaml_source import (
     YamlValue,
     parse_yaml,
 )
-from rsltrace.job.values.checks import FROM_FILE
 from rsltrace.job.values.mappings import TextWithFolder
 from rsltrace.job.values.problem import JobProblem, Loc, format_loc, unknown_key
 from rsltrace.trace.model.regular_file import read_regular
@@ -144,7 +140,9 @@ def _load(
 
     job_keys = [key for key, _ in file_fields(Job)]
     composing = {key for key, _ in file_fields(CompositionKeys)}
-    problems = _composition_problems({key: given[key] for key in given if key in composing})
+    problems: list[JobProblem] = []
+    keys = {key: given[key] for key in given if key in composing}
+    CompositionKeys.made(keys, problems, in_file=True)
     values: dict[str, object] = {}
     for key, value in given.items():
         if only and key not in only:
@@ -160,11 +158,8 @@ def _load(
         values["source_text"] = composed.source.text
     else:
         values["composed"] = composed
-    try:
-        job = Job.model_validate(values, context=FROM_FILE)
-    except ValidationError as error:
-        problems += worded_problems(error, Job)
-    if problems:
+    job = Job.made(values, problems, in_file=True)
+    if job is None or problems:
         raise _job_error(composed.root, problems)
     return job
 
@@ -172,14 +167,6 @@ def _load(
 def _parse(name: str) -> YamlSource:
     folder = os.path.dirname(os.path.abspath(name))
     return parse_yaml(_read(Path(name)), name, folder=folder)
-
-
-def _composition_problems(values: dict[str, object]) -> list[JobProblem]:
-    try:
-        CompositionKeys.model_validate(values, context=FROM_FILE)
-    except ValidationError as error:
-        return worded_problems(error, CompositionKeys)
-    return []
 
 
 def _beside(path: Path) -> str:

@@ -6,20 +6,14 @@ from collections.abc import Callable, Iterable
 from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, ValidationInfo
-
 from rsltrace.errors import nearest
 from rsltrace.job.values.names import check_glob
 from rsltrace.job.values.problem import JobProblem, ProblemCollector, as_flag, describe
 from rsltrace.job.values.times import TIME_SCHEMA, parse_time
 
-FROM_FILE = {"from_file": True}
-"""The validation context of a job that is read from a file."""
-
-
-def from_file(info: ValidationInfo) -> bool:
-    """Say whether the value being validated was read from a job file."""
-    return info.context is not None
+Check = Callable[[object, bool], object]
+"""Returns the value of a field, or raises ``ValueError``: from what is given, and whether that is
+read from a file."""
 
 
 def attach(function: Any, **facts: object) -> Any:
@@ -34,21 +28,19 @@ def attach(function: Any, **facts: object) -> Any:
     return function
 
 
-def check(
-    function: Callable[[Any], object], *, optional: bool = False, **facts: object
-) -> BeforeValidator:
-    """Make a field validator of ``function``, which returns the value or raises ``ValueError``.
+def check(function: Callable[[Any], object], *, optional: bool = False, **facts: object) -> Check:
+    """Make the check of a field of ``function``, which returns the value or raises ``ValueError``.
 
     ``optional`` lets ``None`` through when the part is built in Python; ``attach`` explains
     ``facts``.
     """
 
-    def validate(value: object, info: ValidationInfo) -> object:
-        if value is None and from_file(info):
+    def validate(value: object, in_file: bool) -> object:
+        if value is None and in_file:
             raise JobProblem("no value is given: give one, or leave the key out")
         return None if value is None and optional else function(value)
 
-    return BeforeValidator(attach(validate, schema=getattr(function, "schema", None), **facts))
+    return attach(validate, schema=getattr(function, "schema", None), **facts)  # type: ignore[no-any-return]
 
 
 given = check(lambda value: value, optional=True)
@@ -60,8 +52,8 @@ def is_plain(value: object) -> bool:
     return isinstance(value, (str, int, float)) and not isinstance(value, bool)
 
 
-def part(shorthand: str) -> BeforeValidator:
-    """Prepare one optional part for pydantic; a plain value stands for ``{shorthand: value}``."""
+def part(shorthand: str) -> Check:
+    """Prepare one optional part; a plain value stands for ``{shorthand: value}``."""
     return check(
         lambda value: {shorthand: value} if is_plain(value) else value,
         optional=True,
@@ -69,8 +61,8 @@ def part(shorthand: str) -> BeforeValidator:
     )
 
 
-def parts(shorthand: str | None = None, *, optional: bool = False) -> BeforeValidator:
-    """Prepare a list of parts for pydantic; plain text stands for ``{shorthand: text}``."""
+def parts(shorthand: str | None = None, *, optional: bool = False) -> Check:
+    """Prepare a list of parts; plain text stands for ``{shorthand: text}``."""
 
     def entries(values: object) -> object:
         if not isinstance(values, (list, tuple)):
@@ -85,10 +77,8 @@ def parts(shorthand: str | None = None, *, optional: bool = False) -> BeforeVali
     return check(entries, optional=optional, entry_shorthand=shorthand)
 
 
-def named_parts(
-    shorthand: str, rule: Callable[[str], None], *, what: str = "models"
-) -> BeforeValidator:
-    """Prepare a mapping of names to parts for pydantic; a plain value stands for
+def named_parts(shorthand: str, rule: Callable[[str], None], *, what: str = "models") -> Check:
+    """Prepare a mapping of names to parts; a plain value stands for
     ``{shorthand: value}``."""
 
     def entries(values: object) -> object:

@@ -1,6 +1,6 @@
 """What is wrong with a value of a job: a message for its author, and the place within the value.
 
-Checks raise ``JobProblem`` (a ``ValueError``, so pydantic collects it with its own findings).
+Checks raise ``JobProblem``; all findings about a job are told at once.
 """
 
 from __future__ import annotations

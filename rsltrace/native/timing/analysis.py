@@ -96,9 +96,7 @@ def with_times(job: Job, times: Mapping[CallbackKey, int]) -> Job:
         name = (callback.node, callback.name)
         longest[name] = max(longest.get(name, 0), time_ns)
     entities = tuple(
-        EntityExecutionSpec.model_validate(
-            {"node": node, "entity": entity, "constant": f"{time_ns}ns"}
-        )
+        EntityExecutionSpec(node=node, entity=entity, constant=f"{time_ns}ns")
         for (node, entity), time_ns in longest.items()
     )
     return job.model_copy(update={"execution": ExecutionSpec(entities=entities)})
