@@ -97,7 +97,6 @@ _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
 def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> ModuleSource:
-    """Return a module with its scopes."""
     module = ModuleSource(name, is_package, tree)
     for parent in ast.walk(tree):
         for child in ast.iter_child_nodes(parent):

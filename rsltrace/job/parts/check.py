@@ -243,7 +243,6 @@ class CheckSpec(JobPart):
 
     @property
     def kind(self) -> str:
-        """The one of ``KINDS`` that is given."""
         return next(kind for kind in self.KINDS if getattr(self, kind) is not None)
 
     @model_validator(mode="after")

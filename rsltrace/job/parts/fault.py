@@ -231,7 +231,6 @@ class FaultSpec(JobPart):
 
     @property
     def kind(self) -> str:
-        """The one of ``ONE_OF`` that is given."""
         return next(kind for kind in self.ONE_OF if getattr(self, kind) is not None)
 
     @property
@@ -241,7 +240,6 @@ class FaultSpec(JobPart):
 
     @property
     def of_node(self) -> bool:
-        """Whether it is about a node."""
         return self.kind in self.OF_NODES
 
     @property

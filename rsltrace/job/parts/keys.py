@@ -24,7 +24,6 @@ class LaterPart:
 
     @classmethod
     def model(cls) -> type[BaseModel]:
-        """Return the part."""
         found: type[BaseModel] = getattr(import_module(cls.HOME), cls.__name__)
         return found
 

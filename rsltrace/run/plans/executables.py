@@ -377,7 +377,6 @@ def _did_you_mean_or(name: str, names: Iterable[str], word: str) -> str:
 
 
 def _python_script(path: Path, target: str, where: str) -> MainProgram:
-    """Return a Python script to run."""
     with path.open("rb") as file:
         first = file.readline(256)
     if is_compiled(path):

@@ -67,7 +67,6 @@ def answer_and_end(run: Callable[[], dict[str, Any]], tell: int) -> None:
 
 
 def source_of(task: dict[str, Any]) -> JobSource:
-    """Return the job of a task."""
     job = task["job"]
     return JobSource(**{**job, "overrides": tuple((one, two) for one, two in job["overrides"])})
 

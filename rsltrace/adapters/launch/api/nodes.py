@@ -294,7 +294,6 @@ class ComposableNodeContainer(Node):
             component.note(context, self.full_name(context))
 
     def full_name(self, context: LaunchContext) -> str:
-        """Return its name with its namespace."""
         values = self._values or self._description.values(context, self.where)
         return full_name(values["namespace"], values["name"] or "")
 

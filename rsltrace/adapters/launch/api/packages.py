@@ -46,7 +46,6 @@ def prefix_of(package: str) -> str:
 
 
 def share_of(package: str) -> str:
-    """Return the ``share`` folder of a package."""
     return os.path.join(prefix_of(package), "share", package)
 
 

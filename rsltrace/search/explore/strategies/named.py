@@ -277,7 +277,6 @@ class _ByNumber:
         choices_left(plain, is_forked=self._after is not None)
 
     def learn(self, result: TrialResult) -> TrialResult | None:
-        """Learn nothing."""
         return None
 
 
@@ -369,7 +368,6 @@ class VaryWalk:
         return Proposal({"set": values}, why)
 
     def learn(self, result: TrialResult) -> TrialResult | None:
-        """Learn nothing."""
         return None
 
     def recall(self, result: TrialResult) -> None:
