@@ -13,6 +13,7 @@ from typing import Any
 
 from rsltrace.errors import ExploreError, JobError
 from rsltrace.job import Job, locate
+from rsltrace.job.dump import plain_part, plain_value
 from rsltrace.job.parts.vary import SettingSpec, VarySpec
 from rsltrace.run.plans.scheduling import switches_at_lines
 from rsltrace.search.explore.strategies.faults import FaultWalk
@@ -96,7 +97,8 @@ def check_vary(source: JobSource, job: Job) -> None:
         raise ExploreError(f"{source.path} has no vary:, which says what to vary and between what")
     for name, setting in job.vary.settings.items():
         where = locate(job, ("vary", "settings", name))
-        for value in _extremes(setting):
+        ends = _axis(setting) if setting.values else [_value(setting, 0.0), _value(setting, 1.0)]
+        for value in ends:
             try:
                 source.job(Trial(0, {"set": {name: value}}))
             except JobError as error:
@@ -104,17 +106,10 @@ def check_vary(source: JobSource, job: Job) -> None:
                 raise JobError(f"{name} cannot be {value}:\n{said}", where=where) from None
 
 
-def _extremes(setting: SettingSpec) -> list[Any]:
-    """Return the values that show whether a job can have all of them."""
-    if setting.values is not None:
-        return [_plain(value) for value in setting.values]
-    return [_value(setting, 0.0), _value(setting, 1.0)]
-
-
 def _axis(setting: SettingSpec) -> list[Any]:
     """Return the values that a grid has of a setting."""
     if setting.values is not None:
-        return [_plain(value) for value in setting.values]
+        return [plain_value(value, plain_part) for value in setting.values]
     if setting.integers is not None:
         first, last = setting.bounds
         return list(range(int(first), int(last) + 1))
@@ -126,7 +121,7 @@ def _value(setting: SettingSpec, share: float) -> Any:
     """Return the value at a share (0 to 1) of what a setting may be."""
     if setting.values is not None:
         place = min(int(share * len(setting.values)), len(setting.values) - 1)
-        return _plain(setting.values[place])
+        return plain_value(setting.values[place], plain_part)
     first, second = setting.bounds
     if setting.integers is not None:
         return min(int(first) + int(share * (second - first + 1)), int(second))
@@ -139,18 +134,6 @@ def _value(setting: SettingSpec, share: float) -> Any:
     if setting.of_time:
         return f"{max(round(found), 0)}ns"
     return float(f"{found:.{_DIGITS}g}")  # what a person may type, and exactly what is used
-
-
-def _plain(value: Any) -> Any:
-    """Return a value of a job file as JSON has it."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    for kind in (bool, int, float, str):
-        if isinstance(value, kind):
-            return kind(value)
-    return value
 
 
 # Orders near those that have shown something new: one more departure from one of them.
