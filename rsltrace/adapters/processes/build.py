@@ -255,9 +255,6 @@ def _check(name: str, status: int, said: str) -> None:
     )
 
 
-__all__ = ["PreloadLibrary", "RosInstallation", "find_compiler", "find_ros", "library"]
-
-
 # From a file to a command line: what runs it, and the environment it needs.
 
 _ELF = b"\x7fELF"

@@ -547,6 +547,3 @@ def _below(file: Path, folder: Path) -> str:
         return str(file.relative_to(folder))
     except ValueError:
         return str(file)
-
-
-__all__ = ["CMakeCommand", "commands", "is_expanded"]

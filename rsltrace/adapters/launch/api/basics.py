@@ -335,24 +335,3 @@ def as_job_error(error: BaseException, where: str) -> JobError:
     name = type(error).__name__
     said = _missing_file(error) or (f"{name}: {said}" if said else name)
     return JobError(said, where=where)
-
-
-__all__ = [
-    "NOWHERE",
-    "WHY",
-    "Action",
-    "Condition",
-    "LaunchContext",
-    "LaunchDescription",
-    "LaunchDescriptionEntity",
-    "Substitution",
-    "SubstitutionFailure",
-    "TextSubstitution",
-    "as_job_error",
-    "as_substitutions",
-    "calling_line",
-    "missing_package",
-    "perform_substitutions",
-    "shown",
-    "visit_all",
-]

@@ -329,14 +329,3 @@ def _words(context: LaunchContext, given: Any) -> tuple[str, ...]:
 
 def _number(context: LaunchContext, value: Any) -> float:
     return float(value if isinstance(value, (int, float)) else context.text(value))
-
-
-__all__ = [
-    "ComposableNode",
-    "ComposableNodeContainer",
-    "ExecuteLocal",
-    "ExecuteProcess",
-    "LifecycleNode",
-    "LoadComposableNodes",
-    "Node",
-]
