@@ -143,13 +143,12 @@ _ORDERS_MAX = 2_000
 _NEW_SEEDS = 0.2
 
 
-class Feedback:
+class Feedback(Strategy):
     """Keeps the orders of runs in which something happened that had not happened before (an event
     with its content and its node's state, two events of a node in that order), and departs from
     one of them at one more choice; the newest are taken most often."""
 
     behaviours = True
-    steps = False
 
     def __init__(self, seed: int = 0, *, is_forked: bool = False) -> None:
         """``is_forked``: runs begin as the plain one, with its seed."""
@@ -235,11 +234,8 @@ class Feedback:
 # Random orders: a walk that chooses among all that could run, and PCT with its guarantee.
 
 
-class _ByNumber:
+class _ByNumber(Strategy):
     """A strategy whose trials follow from their numbers."""
-
-    behaviours = False
-    steps = False
 
     def __init__(self, seed: int, after: str | None) -> None:
         """``after``: the simulated time up to which the order is the plain one, and the job's own
@@ -258,9 +254,6 @@ class _ByNumber:
     def begin(self, plain: TrialResult) -> None:
         """See that there is something to choose."""
         choices_left(plain, is_forked=self._after is not None)
-
-    def learn(self, result: TrialResult) -> TrialResult | None:
-        return None
 
 
 class RandomWalk(_ByNumber):
@@ -325,11 +318,8 @@ class PctWalk(_ByNumber):
 # Other settings: the combinations that ``vary:`` of the job describes.
 
 
-class VaryWalk:
+class VaryWalk(Strategy):
     """One combination of settings after the other; order and seed are the job's."""
-
-    behaviours = False
-    steps = False
 
     def __init__(self, job: Job, seed: int = 0) -> None:
         if job.vary is None:
@@ -349,9 +339,6 @@ class VaryWalk:
         self._tried += 1
         why = ", ".join(f"{name} = {value}" for name, value in values.items())
         return Proposal({"set": values}, why)
-
-    def learn(self, result: TrialResult) -> TrialResult | None:
-        return None
 
     def recall(self, result: TrialResult) -> None:
         self._tried += 1
@@ -419,11 +406,9 @@ def _check_forks(name: str, job: Job) -> None:
         )
 
 
-class MixedStrategy:
+class MixedStrategy(Strategy):
     """Several strategies in turn. Those whose trials follow from their numbers, or that always have
     something to propose."""
-
-    steps = False
 
     def __init__(self, strategies: Sequence[Strategy]) -> None:
         self._strategies = tuple(strategies)
