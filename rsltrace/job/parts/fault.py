@@ -254,10 +254,7 @@ class FaultSpec(JobPart):
 
     @model_validator(mode="after")
     def _says_one_thing(self) -> FaultSpec:
-        given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
-        if len(given) != 1:
-            what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}: {what}")
+        self._only(self.ONE_OF)
         for key, field, kinds in (
             ("at", self.at_ns, self.OF_NODES),
             ("event", self.event, self.OF_NODES),
@@ -286,10 +283,7 @@ class FaultSpec(JobPart):
             return
         if self.field is None:
             raise JobProblem(f"what changes? Give field: a field of {self.change}", ("change",))
-        given = [key for key in self.CHANGES if getattr(self, key) is not None]
-        if len(given) != 1:
-            what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise JobProblem(f"give one of {', '.join(self.CHANGES)}: {what}", ("field",))
+        self._only(self.CHANGES, ("field",))
 
     def _says_when(self) -> None:
         if not self.of_node:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -184,6 +184,14 @@ class JobPart(BaseModel):
                 data = {**data, key: _counted(data[name])}
                 del data[name]
         return data
+
+    def _only(self, keys: Sequence[str], at: tuple[str, ...] = ()) -> str:
+        """Return which of ``keys`` is given; it is a problem (``at``) if that is not one."""
+        given = [key for key in keys if getattr(self, key) is not None]
+        if len(given) != 1:
+            what = f"{' and '.join(given)} are given" if given else "none is given"
+            raise JobProblem(f"give one of {', '.join(keys)}: {what}", at)
+        return given[0]
 
     @classmethod
     def _times(cls) -> Iterator[tuple[str, str]]:
