@@ -479,7 +479,7 @@ WRITES = {
     # Where Python packages are, under the names in wheels of the package index.
     "rsltrace/cli/install_ros.py": "mkdir write_bytes write_text",
     # Nowhere.
-    "rsltrace/adapters/rclpy/terminals/calls.py": "open",
+    "rsltrace/adapters/rclpy/terminals.py": "open",
     "rsltrace/cli/output/exit_status.py": "open",
     "rsltrace/search/explore/prefix.py": "open",
     # Sockets between processes of one command, or only on this machine.

@@ -28,7 +28,7 @@ _CALLS_BACK = os.path.join(_HERE, "simulation", "middleware", "events", "dispatc
 _THREADS = os.path.join(_ADAPTER, "concurrency", "threads.py")
 _REPLACEMENTS = (
     os.path.join(_ADAPTER, "concurrency", "asyncio_loops.py"),
-    os.path.join(_ADAPTER, "terminals", "calls.py"),
+    os.path.join(_ADAPTER, "terminals.py"),
 )
 """Replacements of parts of asyncio, os and select: their callers count."""
 

@@ -104,7 +104,6 @@ def _write_slots(kinds: list[type], name: str, value: int | None) -> None:
 
 
 def _subclasses_of(kind: type) -> set[type]:
-    """Return a type with all its subclasses."""
     found, waiting = {kind}, [kind]
     while waiting:
         new: set[type] = set(type.__subclasses__(waiting.pop())) - found

@@ -105,7 +105,6 @@ class Redirected:
         place.vectorcall = _VECTORCALLS[flags]
 
     def restore(self) -> None:
-        """Undo the redirection."""
         place = _Function.from_address(id(self._function))
         place.definition, place.owner, place.vectorcall = self._saved
         _count_down(id(self._target))
@@ -157,7 +156,6 @@ class RedirectedMethod:
         place.function = id(target)
 
     def restore(self) -> None:
-        """Undo the redirection."""
         _Method.from_address(id(self._method)).function = self._saved
         _count_down(id(self._target))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from io import StringIO
 from typing import Any
 
@@ -23,7 +24,7 @@ def job_yaml(job: JobFields) -> str:
     yaml.width = 2**20  # Folding long text would make it hard to read and to search.
     yaml.indent(mapping=2, sequence=4, offset=2)
     stream = StringIO()
-    yaml.dump(_quoted(_explicit(job)), stream)
+    yaml.dump(_quoted(plain_part(job)), stream)
     return stream.getvalue()
 
 
@@ -64,17 +65,13 @@ def _relative(job: JobFields, path: str) -> str:
 
 def plain_part(part: JobPart) -> dict[str, Any]:
     """Return a part of a job as a job file has it: every key that differs from its default."""
-    return _explicit(part)
-
-
-def _explicit(part: JobPart) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, field in type(part).model_fields.items():
         value = getattr(part, name)
         if field.exclude or value == field.get_default():
             continue
         key = field.alias or name
-        values[key] = _times(value) if part.counts_ns(name) else _plain(value, _explicit)
+        values[key] = _times(value) if part.counts_ns(name) else plain_value(value, plain_part)
     return values
 
 
@@ -90,17 +87,18 @@ def _complete(part: JobPart) -> dict[str, Any]:
     absent = part.absent if isinstance(part, NodeSpec) else ()
     for name, field in type(part).model_fields.items():
         if not field.exclude and name not in absent:
-            values[name] = _json(_plain(getattr(part, name), _complete))
+            values[name] = _json(plain_value(getattr(part, name), _complete))
     return values
 
 
-def _plain(value: Any, part_values: Any) -> Any:
+def plain_value(value: Any, part_values: Callable[[JobPart], Any]) -> Any:
+    """Return a value of a job as JSON has it, parts in it as ``part_values`` says."""
     if isinstance(value, JobPart):
         return part_values(value)
     if isinstance(value, dict):
-        return {str(key): _plain(item, part_values) for key, item in value.items()}
+        return {str(key): plain_value(item, part_values) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item, part_values) for item in value]
+        return [plain_value(item, part_values) for item in value]
     # Subclasses (numpy's float64, an enum of integers) are written as what they are.
     for kind in (bool, int, float, str):
         if isinstance(value, kind):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import did_you_mean
@@ -13,7 +14,7 @@ from rsltrace.job.parts.node import NodeSpec
 from rsltrace.job.parts.part import after_fields
 from rsltrace.job.parts.stop import StopSpec
 from rsltrace.job.values.mappings import near_path
-from rsltrace.job.values.problem import JobProblem, JobProblems
+from rsltrace.job.values.problem import JobProblem, JobProblems, Loc
 from rsltrace.job.values.times import format_time
 
 # Entries that start after others: which entry is meant, and orders that cannot be.
@@ -171,11 +172,6 @@ def _distinct_names(job: JobFields) -> Iterator[JobProblem]:
         first.setdefault(key, index)
 
 
-def _near(job: JobFields, path: str) -> str:
-    """Say what there is instead of a path that does not lead anywhere."""
-    return near_path(job.resolve(path), path)
-
-
 def _ties_are_decided_once(job: JobFields) -> Iterator[JobProblem]:
     if job.timer_ties == "heap" and not (
         (job.policy is None or job.policy.order == "fifo")
@@ -189,46 +185,36 @@ def _ties_are_decided_once(job: JobFields) -> Iterator[JobProblem]:
         )
 
 
-def _paths_exist(job: JobFields) -> Iterator[JobProblem]:
+def _paths(job: JobFields) -> Iterator[tuple[Loc, str, str]]:
+    """Yield the place of each path in a job, the path, and what has to be there."""
     for index, folder in enumerate(job.search_path):
-        path = job.resolve(folder)
-        if not path.is_dir():
-            what = "is not a folder" if path.exists() else "there is no such folder"
-            near = _near(job, folder)
-            yield JobProblem(f"{folder!r}: {what}{near}", ("search_path", index))
+        yield ("search_path", index), folder, "folder"
     for index, node in enumerate(job.nodes):
         for number, file in enumerate(node.parameter_files):
-            path = job.resolve(file)
-            if not path.is_file():
-                what = "is not a file" if path.exists() else "there is no such parameter file"
-                loc = ("nodes", index, "parameter_files", number)
-                yield JobProblem(f"{file!r}: {what}{_near(job, file)}", loc)
-    scripts = [
-        (("nodes", index, node.kind), node.script or node.program or "")
-        for index, node in enumerate(job.nodes)
-        if node.script is not None or node.program is not None
-    ]
-    typed = [
-        (("nodes", index, "stdin", number, "file"), item.file)
-        for index, node in enumerate(job.nodes)
-        for number, item in enumerate(node.stdin or ())
-        if item.file is not None
-    ]
-    for place, file in [*scripts, *typed, *job.model_files()]:
-        path = job.resolve(file)
-        if not path.is_file():
-            what = "is not a file" if path.exists() else "there is no such file"
-            yield JobProblem(f"{file!r}: {what}{_near(job, file)}", place)
+            yield ("nodes", index, "parameter_files", number), file, "parameter file"
+    for index, node in enumerate(job.nodes):
+        if (program := node.script or node.program) is not None:
+            yield ("nodes", index, node.kind), program, "file"
+    for index, node in enumerate(job.nodes):
+        for number, item in enumerate(node.stdin or ()):
+            if item.file is not None:
+                yield ("nodes", index, "stdin", number, "file"), item.file, "file"
+    for place, file in job.model_files():
+        yield place, file, "file"
     for index, launch in enumerate(job.launch):
-        path = job.resolve(launch.file)
-        if not path.is_file():
-            what = "is not a file" if path.exists() else "there is no such launch file"
-            place = ("launch", index, "file")
-            yield JobProblem(f"{launch.file!r}: {what}{_near(job, launch.file)}", place)
+        yield ("launch", index, "file"), launch.file, "launch file"
     for index, bag in enumerate(job.bags):
-        if not job.resolve(bag.path).exists():
-            message = f"{bag.path!r}: there is no such bag{_near(job, bag.path)}"
-            yield JobProblem(message, ("bags", index, "path"))
+        yield ("bags", index, "path"), bag.path, "bag"
+
+
+def _paths_exist(job: JobFields) -> Iterator[JobProblem]:
+    for place, path, what in _paths(job):
+        full = job.resolve(path)
+        is_there = {"folder": Path.is_dir, "bag": Path.exists}.get(what, Path.is_file)
+        if not is_there(full):
+            other = f"is not a {'folder' if what == 'folder' else 'file'}"
+            said = other if full.exists() else f"there is no such {what}"
+            yield JobProblem(f"{path!r}: {said}{near_path(full, path)}", place)
 
 
 class Job(JobFields):

@@ -51,7 +51,6 @@ class PageKeeper:
         self._partial = partial[: 4 * _LINE_MAX]
 
     def add(self, line: str) -> None:
-        """Add the next line."""
         self._count += 1
         is_full = not self._end and self._count - self._skip > len(self._lines) + 1
         if self._count <= self._skip or is_full:

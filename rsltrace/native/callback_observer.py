@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
 from typing import Any
 
+import rclpy.executors
 from rclpy.executors import (
     ConditionReachedException,
     ShutdownException,
@@ -106,6 +107,13 @@ class PriorityExecutor(SingleThreadedExecutor):  # type: ignore[misc]
         if task.exception() is not None:
             raise task.exception()
         task.result()
+
+
+def make_executor(name: str, priorities: Priorities | None) -> Any:
+    """Return an executor: rclpy's of a name, or one that goes by priorities."""
+    if priorities is not None:
+        return PriorityExecutor(priorities)
+    return getattr(rclpy.executors, name)()
 
 
 EXECUTORS = {"single": "SingleThreadedExecutor", "multi": "MultiThreadedExecutor"}

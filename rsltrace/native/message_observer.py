@@ -105,10 +105,10 @@ class MessageObserver:
             (extension.Publisher, "publish", self._publish),
             (extension.Publisher, "publish_raw", self._publish),
             (extension.Subscription, "take_message", self._take_message),
-            (extension.Client, "send_request", self._send_request),
+            (extension.Client, "send_request", self._sends(_REQUEST)),
             (extension.Client, "take_response", self._take_exchange(_RESPONSE)),
             (extension.Service, "service_take_request", self._take_exchange(_REQUEST)),
-            (extension.Service, "service_send_response", self._send_response),
+            (extension.Service, "service_send_response", self._sends(_RESPONSE)),
             (extension.Timer, "call_timer", self._call_timer),
             (extension.LifecycleStateMachine, "trigger_transition_by_id", self._trigger),
             (extension.LifecycleStateMachine, "trigger_transition_by_label", self._trigger),
@@ -116,7 +116,7 @@ class MessageObserver:
         ]
         for name, sends in _ACTION_SENDS.items():
             for method, (part, kind) in sends.items():
-                wrap = self._action_sends(part, kind)
+                wrap = self._sends(kind, part)
                 wraps_of.append((getattr(extension, name), method, wrap))
         for name, takes in _ACTION_TAKES.items():
             for method, part in takes.items():
@@ -287,35 +287,6 @@ class MessageObserver:
 
     # -- services --------------------------------------------------------------------------------
 
-    def _send_request(self, original: Callable[..., int]) -> Callable[..., int]:
-        @wraps(original)
-        def send_request(handle: Any, request: Any) -> int:
-            entity = self._entities.find(handle)
-            if entity is None:
-                return original(handle, request)
-            with self._sending() as span:
-                before_ns = time.time_ns()
-                sequence = original(handle, request)
-                self._sent(span, _REQUEST, entity, request, sequence, before_ns, now_ns())
-            return sequence
-
-        return send_request
-
-    def _send_response(self, original: Callable[..., None]) -> Callable[..., None]:
-        @wraps(original)
-        def send_response(handle: Any, response: Any, request_id: Any) -> None:
-            entity = self._entities.find(handle)
-            if entity is None:
-                original(handle, response, request_id)
-                return
-            with self._sending() as span:
-                before_ns = time.time_ns()
-                original(handle, response, request_id)
-                number = request_id.sequence_number
-                self._sent(span, _RESPONSE, entity, response, number, before_ns, now_ns())
-
-        return send_response
-
     def _take_exchange(self, kind: int) -> Callable[..., Any]:
         """Wrap what takes a request or a response: it gives message and header in some order."""
 
@@ -344,12 +315,17 @@ class MessageObserver:
 
     # -- actions ---------------------------------------------------------------------------------
 
-    def _action_sends(self, part: str, kind: int) -> Callable[..., Any]:
+    def _sends(self, kind: int, part: str = "") -> Callable[..., Any]:
+        """Wrap what sends a request or a response, or, as a ``part`` of an action, anything."""
+
         def wrapping(original: Callable[..., Any]) -> Callable[..., Any]:
             @wraps(original)
             def send(handle: Any, *words: Any) -> Any:
-                parts = self._entities.parts.get(handle)
-                if parts is None:
+                if part:
+                    entity = self._entities.parts.get(handle, {}).get(part)
+                else:
+                    entity = self._entities.find(handle)
+                if entity is None:
                     return original(handle, *words)
                 with self._sending() as span:
                     before_ns = time.time_ns()
@@ -358,9 +334,11 @@ class MessageObserver:
                     if kind == _MESSAGE:  # who takes it learns no number
                         sequence = 0
                     else:
-                        sequence = given if kind == _REQUEST else words[0].sequence_number
-                    message = words[-1] if words else None  # a status is made by rcl
-                    self._sent(span, kind, parts[part], message, sequence, before_ns, now_ns())
+                        answered = words[0 if part else -1]
+                        sequence = given if kind == _REQUEST else answered.sequence_number
+                    # The status of an action is made by rcl; only a service has the number last.
+                    message = words[-1 if part else 0] if words else None
+                    self._sent(span, kind, entity, message, sequence, before_ns, now_ns())
                 return given
 
             return send

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from rsltrace.errors import JobError, RsltraceError, RunError, SetupError
+from rsltrace.errors import JobError, NodeError, RsltraceError, RunError, SetupError
 from rsltrace.job import Job, locate
 from rsltrace.native import support
 from rsltrace.native.last_seconds import LastSeconds, LiveChecks, Programs
@@ -70,15 +70,6 @@ class NativeResult:
     kept: str = ""
     failed_checks: Mapping[str, int] = field(default_factory=dict)
     """How often checks failed while only the last seconds were kept."""
-
-
-@dataclass(frozen=True, slots=True)
-class ProcessorTime:
-    """Processor time in nanoseconds: ``callbacks_ns`` of the nodes with rclpy and the middleware
-    (and what observes them in their threads), ``beside_ns`` of reporting it."""
-
-    callbacks_ns: int
-    beside_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,10 +328,33 @@ class NativeRun:
                 self.error = error
         self.stop(Stop(reason or str(error).splitlines()[0], error.exit_code))
 
+    def raised(
+        self, what: str, entry: str, node: str, kind: str, said: str, traceback: str
+    ) -> None:
+        """End the run because code of the user raised an exception."""
+        reason = f"{what} raised {kind}"
+        stamp_ns = self.clocks.stamp(time.monotonic_ns())
+        error = NodeError(
+            f"{reason}: {said}",
+            node=node,
+            entity=entry,
+            stamp_ns=stamp_ns,
+            traceback_text=traceback,
+        )
+        self.fail(error, reason)
+
     def close(
-        self, ended_after: int, stuck: tuple[str, ...], unreadable: int, spent: ProcessorTime
+        self,
+        ended_after: int,
+        stuck: tuple[str, ...],
+        unreadable: int,
+        *,
+        callbacks_ns: int,
+        beside_ns: int = 0,
     ) -> NativeResult:
-        """Write what is left, close the trace, and say how it went.
+        """Write what is left, close the trace, and say how it went. Processor time: that of
+        callbacks with rclpy and the middleware (and what observes them in their threads), and that
+        of reporting it beside them.
 
         :raises OutputError: if the trace cannot be written.
         """
@@ -349,10 +363,11 @@ class NativeRun:
         stop = self.ending or Stop("nothing is left")
         exit_code = self.error.exit_code if self.error is not None else stop.exit_code
         observer_ns = self.span_writer.observer_ns
-        pen_ns = (self.span_writer.cpu_ns + spent.beside_ns) // max(events, 1)
-        callback_ns = spent.callbacks_ns // max(events, 1)
+        pen_ns = (self.span_writer.cpu_ns + beside_ns) // max(events, 1)
+        callback_ns = callbacks_ns // max(events, 1)
         more = {"pen_ns": str(pen_ns), "callback_ns": str(callback_ns), **self._levels()}
         self._close_trace(self.writer, self.span_writer, stop.reason, exit_code, ended_after, more)
+        checks = None if self.last is None else self.last.checks
         return NativeResult(
             path=self.writer.place,
             events=events,
@@ -366,12 +381,8 @@ class NativeRun:
             stuck=stuck,
             notes=(*self.notes, *_said(stuck, unreadable)),
             kept=self.writer.kept,
-            failed_checks=self._failed_checks(),
+            failed_checks={} if checks is None else checks.failed,
         )
-
-    def _failed_checks(self) -> Mapping[str, int]:
-        checks = None if self.last is None else self.last.checks
-        return {} if checks is None else checks.failed
 
     def _levels(self) -> dict[str, str]:
         if self.options.policy is None:

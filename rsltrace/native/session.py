@@ -12,10 +12,10 @@ from rsltrace.adapters.rclpy.boundary.installation import (
     check_no_simulation,
     native_extension,
 )
-from rsltrace.errors import JobError, NodeError, RunError
+from rsltrace.errors import JobError, RunError
 from rsltrace.job import Job
 from rsltrace.native import support
-from rsltrace.native.callback_observer import EXECUTORS, CallbackObserver
+from rsltrace.native.callback_observer import EXECUTORS, CallbackObserver, make_executor
 from rsltrace.native.message_observer import MessageObserver
 from rsltrace.native.native_run import (
     ENDS_WITHIN_S,
@@ -23,7 +23,6 @@ from rsltrace.native.native_run import (
     NativeOptions,
     NativeResult,
     NativeRun,
-    ProcessorTime,
     rclpy_running,
 )
 from rsltrace.native.node_observer import NodeObserver
@@ -133,13 +132,7 @@ class SingleProcessRun(NativeRun):
                 return
 
     def _make_executor(self) -> Any:
-        if self.priorities is not None:
-            from rsltrace.native.callback_observer import PriorityExecutor
-
-            return PriorityExecutor(self.priorities)
-        import rclpy.executors
-
-        return getattr(rclpy.executors, EXECUTORS[self.options.executor])()
+        return make_executor(EXECUTORS[self.options.executor], self.priorities)
 
     def _ended(self, one: RunningEntry, error: BaseException | None) -> None:
         """Take note that an entry is over."""
@@ -150,18 +143,9 @@ class SingleProcessRun(NativeRun):
         if isinstance(error, JobError):
             self.fail(RunError(str(error)))
             return
-        reason, node = one.failed_in, one.node_name
-        reason = f"{reason} raised {type(error).__qualname__}"
-        self.fail(
-            NodeError(
-                f"{reason}: {exception_text(error)}",
-                node=node,
-                entity=one.entry.name,
-                stamp_ns=self.clocks.stamp(time.monotonic_ns()),
-                traceback_text=user_traceback(error),
-            ),
-            reason,
-        )
+        kind, said = type(error).__qualname__, exception_text(error)
+        traceback = user_traceback(error)
+        self.raised(one.failed_in, one.entry.name, one.node_name, kind, said, traceback)
 
     def finish(self) -> NativeResult:
         """Stop the entries, destroy the nodes, close the trace, and say how it went.
@@ -180,5 +164,6 @@ class SingleProcessRun(NativeRun):
                 destroy(one.nodes, self.recorder, self.entities)
         if self.priorities is not None:
             self.levels.update(self.priorities.levels)
-        spent = ProcessorTime(time.process_time_ns() - self._cpu_ns - self.span_writer.cpu_ns)
-        return self.close(ended_after, stuck, self.message_observer.unreadable, spent)
+        cpu_ns = time.process_time_ns() - self._cpu_ns - self.span_writer.cpu_ns
+        unreadable = self.message_observer.unreadable
+        return self.close(ended_after, stuck, unreadable, callbacks_ns=cpu_ns)

@@ -215,7 +215,6 @@ class SpanWriter(threading.Thread):
         self.write(None)
 
     def write(self, patience_ns: int | None) -> None:
-        """Write the spans that are over."""
         for span in self._source.finished(patience_ns):
             self._write(span)
 

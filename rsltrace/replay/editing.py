@@ -86,7 +86,7 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
 def arrived_for_action(handle: Any, kind: int) -> Any:
     """Return the part of an action (goal, response, feedback) whose arrival a coroutine is about to
     take, or None."""
-    from rsltrace.adapters.rclpy.actions.action_handle import ActionEndpoint
+    from rsltrace.adapters.rclpy.handles.actions import ActionEndpoint
 
     parts = (
         one for one in _begun_with(handle, kind) if isinstance(one, ActionEndpoint) and one.queue
@@ -103,7 +103,7 @@ def _begun_with(run: Any, kind: int) -> list[Any]:
 
 def _change_arrival(part: Any, edit: Edit) -> int:
     """Change the first arrival in a queue; return its hash."""
-    from rsltrace.adapters.rclpy.actions.action_handle import ActionService, ActionServiceClient
+    from rsltrace.adapters.rclpy.handles.actions import ActionService, ActionServiceClient
     from rsltrace.adapters.rclpy.messages.codec import codec_for
 
     if isinstance(part, ActionService):

@@ -12,8 +12,13 @@ golden traces after an intended change; ``rsltrace_node`` is the fixture for one
 this package loads neither rclpy nor numpy.
 """
 
-from rsltrace.testing.golden import GoldenMismatch, assert_matches_golden, run_job
-from rsltrace.testing.nodes import NodeChanged, assert_node_unchanged
+from rsltrace.testing.golden import (
+    GoldenMismatch,
+    NodeChanged,
+    assert_matches_golden,
+    assert_node_unchanged,
+    run_job,
+)
 
 __all__ = [
     "GoldenMismatch",

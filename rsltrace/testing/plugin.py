@@ -148,7 +148,7 @@ def rsltrace_node(request: pytest.FixtureRequest) -> Callable[..., NodeReplayRes
     def check(trace: str | Path, node: str, **options: Any) -> NodeReplayResult:
         __tracebackhide__ = True
         from rsltrace.errors import RsltraceError, RunError
-        from rsltrace.testing.nodes import NodeChanged, assert_node_unchanged
+        from rsltrace.testing.golden import NodeChanged, assert_node_unchanged
 
         for name in ("job_folder", "bag"):
             if isinstance(options.get(name), (str, Path)):

@@ -18,10 +18,10 @@ import pytest
 from campaigns.attack import mcap_parts
 from campaigns.attack.families.texts import with_strings
 from rsltrace.child_processes import rsltrace_command
-from rsltrace.mcp_server import guides
 from rsltrace.mcp_server.access import Access, RefusedError
 from rsltrace.mcp_server.answers import ANSWER_BYTES_MAX, PageKeeper, answer, bounded, page_of
 from rsltrace.mcp_server.commands import CommandResult, run_command
+from rsltrace.mcp_server.server import VERDICTS, job_part
 from rsltrace.mcp_server.sessions import Sessions
 from rsltrace.mcp_server.tools import RUNNING, TOOLS, Tools
 from rsltrace.trace.model.texts import printable_lines
@@ -357,7 +357,7 @@ def test_resources_and_prompts() -> None:
     from rsltrace.job.documents.schema import job_schema
     from rsltrace.mcp_server.server import make_server
 
-    assert set(guides.VERDICTS) == {verdict.value for verdict in Verdict}
+    assert set(VERDICTS) == {verdict.value for verdict in Verdict}
     access = Access((Path.cwd(),), trust=False, limit_s=1)
     made: MCPServer = make_server(Tools(access, Sessions(access)))
 
@@ -372,7 +372,7 @@ def test_resources_and_prompts() -> None:
 
     anyio.run(look)
     parts = [part for part in job_schema()["$defs"] if not part.endswith("Change")]
-    assert [p for p in parts if size(guides.job_part(p)) > ANSWER_BYTES_MAX] == ["Job"]
+    assert [p for p in parts if size(job_part(p)) > ANSWER_BYTES_MAX] == ["Job"]
 
 
 def test_without_the_package_it_says_how_to_install_it(

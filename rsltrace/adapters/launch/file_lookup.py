@@ -87,6 +87,3 @@ def _launch_files(folder: Path) -> list[Path]:
         for path in sorted(folder.rglob("*launch*"))
         if path.suffix in _SUFFIXES and path.is_file()
     ]
-
-
-__all__ = ["launch_file"]

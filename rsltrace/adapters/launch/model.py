@@ -208,7 +208,6 @@ class Element:
         return found
 
     def named(self, tag: str) -> list[Element]:
-        """Return the children of a tag."""
         return [child for child in self.children if child.tag == tag]
 
     def check(self, attributes: Iterable[str], children: Iterable[str] | None = ()) -> None:
@@ -231,7 +230,6 @@ def _unknown(what: str, name: str, tag: str, known: list[str]) -> str:
 
 
 def not_a_launch_file(name: str, why: str) -> JobError:
-    """Return the error that a file is no launch file."""
     return JobError(f"{why}; a launch file is <launch>…</launch> or 'launch: [...]'", where=name)
 
 

@@ -62,6 +62,3 @@ def _load(context: LaunchContext, file: Path) -> LaunchDescription:
             where=shown(here),
         )
     return description
-
-
-__all__ = ["read_launch_file"]

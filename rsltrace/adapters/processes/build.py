@@ -26,6 +26,7 @@ from rsltrace.child_processes import kill_group
 from rsltrace.errors import SetupError
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.pin import MEMORY_NOISE
+from rsltrace.job.reading.substitute import installed_prefixes
 
 SOURCES = Path(__file__).parent / "native"
 OBSERVER = (
@@ -63,8 +64,7 @@ def find_ros() -> RosInstallation:
 
     :raises SetupError: if there is none with headers.
     """
-    listed = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    for prefix in (Path(folder) for folder in [*listed, sys.prefix] if folder):
+    for prefix in installed_prefixes():
         include = prefix / "include"
         if all(
             (include / name).exists() or (include / "fastcdr" / name).exists() for name in _HEADERS
@@ -253,9 +253,6 @@ def _check(name: str, status: int, said: str) -> None:
         f"{name} cannot build the library that processes run with against the headers of "
         f"{_PACKAGES}:\n{shown}"
     )
-
-
-__all__ = ["PreloadLibrary", "RosInstallation", "find_compiler", "find_ros", "library"]
 
 
 # From a file to a command line: what runs it, and the environment it needs.

@@ -221,7 +221,6 @@ class ProcessHandle:
 
     @property
     def pid(self) -> int:
-        """The number of the process."""
         return self._process.pid
 
     def send(self, data: bytes) -> None:
@@ -280,7 +279,6 @@ class ProcessHandle:
         self.kill()
 
     def kill(self) -> None:
-        """Kill the process with all that it has started."""
         kill_group(self._process.pid)
         self._process.wait()
         self._link.close()

@@ -137,7 +137,6 @@ class QueueEndpoint(Receiver):
         raise NotImplementedError
 
     def arriving_type(self) -> str:
-        """Return the type of what arrives."""
         raise NotImplementedError
 
     def changed(
@@ -310,7 +309,6 @@ class ProcessTimer(Timer):
         self.dispatcher.loop.timers.remove(self.state)
 
     def may_run(self) -> bool:
-        """Return whether it is due."""
         return not self.state.canceled and self.state.deadline_ns <= self.dispatcher.loop.now_ns
 
     def dispatch(self) -> None:

@@ -6,6 +6,7 @@ import itertools
 import struct
 from collections.abc import Callable
 from dataclasses import astuple
+from functools import partial
 from typing import Any, Protocol
 
 from rsltrace.adapters.processes.endpoints import (
@@ -222,8 +223,12 @@ class ProcessEntities(dict[int, Any]):
             RecordKind.NODE: self._node,
             RecordKind.PUBLISHER: self._publisher,
             RecordKind.SUBSCRIPTION: self._subscription,
-            RecordKind.SERVICE: self._service,
-            RecordKind.CLIENT: self._client,
+            RecordKind.SERVICE: partial(
+                self._exchange, ProcessService, adapter.domain.graph.add_service
+            ),
+            RecordKind.CLIENT: partial(
+                self._exchange, ProcessClient, adapter.domain.graph.add_client
+            ),
             RecordKind.TIMER: self._timer,
             RecordKind.QOS_EVENT: self._qos_event,
             RecordKind.TIMER_OF: self._timer_of,
@@ -262,21 +267,12 @@ class ProcessEntities(dict[int, Any]):
         self[number] = end
         graph.add_subscription(end)
 
-    def _service(self, fields: RecordReader) -> None:
-        domain = self._adapter.domain
+    def _exchange(self, kind: Any, add: Callable[[Any], None], fields: RecordReader) -> None:
         number, node = fields.number(), self[fields.number()]
         name, type, qos = fields.text(), self._adapter.service_type(fields.text()), fields.qos()
-        end = ProcessService(self._process, number, domain.transport, node, name, type, qos)
-        self[number] = end
-        domain.graph.add_service(end)
-
-    def _client(self, fields: RecordReader) -> None:
-        domain = self._adapter.domain
-        number, node = fields.number(), self[fields.number()]
-        name, type, qos = fields.text(), self._adapter.service_type(fields.text()), fields.qos()
-        end = ProcessClient(self._process, number, domain.transport, node, name, type, qos)
-        self[number] = end
-        domain.graph.add_client(end)
+        transport = self._adapter.domain.transport
+        self[number] = end = kind(self._process, number, transport, node, name, type, qos)
+        add(end)
 
     def _timer(self, fields: RecordReader) -> None:
         number, may_be_an_executors, period_ns = fields.unpack(_TIMER)

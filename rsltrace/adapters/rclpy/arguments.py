@@ -83,7 +83,6 @@ class _Reader:
         return found is not None and self.peek() is first and self.peek(found.end()) is second
 
     def accept(self) -> str:
-        """Read a word."""
         start = self.at
         found = _WORDS.match(self._text, start)
         if found is not None:

@@ -31,7 +31,6 @@ class Component:
 
     @property
     def service(self) -> str:
-        """The service that loads it."""
         return load_service(self.container)
 
     def load(self) -> list[Any]:

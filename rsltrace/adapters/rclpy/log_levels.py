@@ -12,7 +12,6 @@ class LogLevels:
         self._levels: dict[str, int] = {}
 
     def reset(self) -> None:
-        """Forget all levels."""
         self._levels.clear()
 
     def set(self, name: str, level: int) -> None:

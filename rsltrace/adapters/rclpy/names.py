@@ -47,7 +47,6 @@ def full_topic_fault(name: str) -> Fault | None:
 
 
 def namespace_fault(namespace: str) -> Fault | None:
-    """Return what is wrong with a namespace."""
     text = str.encode(namespace)
     if text == b"/":
         return None

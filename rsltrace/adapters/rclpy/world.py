@@ -34,7 +34,7 @@ from rsltrace.adapters.rclpy.handles.node_state import NodeStates
 from rsltrace.adapters.rclpy.hints import constructor_of, is_unmade
 from rsltrace.adapters.rclpy.node_clocks import ClockRule, NodeClocks
 from rsltrace.adapters.rclpy.parameters import Parameters, parameters_of
-from rsltrace.adapters.rclpy.terminals.calls import Terminals, simulated_terminals
+from rsltrace.adapters.rclpy.terminals import Terminals, simulated_terminals
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.guard.redirect import replace_attribute
 from rsltrace.simulation.chance.channel import NetworkPlan

@@ -249,9 +249,3 @@ def _targets(lines: Iterable[object]) -> dict[str, str]:
 def text_mapping(value: object) -> dict[str, str]:
     """Return a mapping with texts for keys and values; an empty one of anything else."""
     return {str(k): str(v) for k, v in value.items()} if isinstance(value, Mapping) else {}
-
-
-__all__ = [
-    *("Groups", "console_scripts_in", "entry_points", "name_and_version", "package_dir"),
-    *("packages", "setup_fault", "setup_py", "source_root"),
-]

@@ -30,7 +30,6 @@ _FOLDER = Path(__file__).with_name("definitions")
 
 
 def bundled_packages() -> dict[str, SourcePackage]:
-    """Return the packages by name."""
     from rsltrace.source_packages import SourcePackage
 
     return {name: SourcePackage(name, _FOLDER / name) for name in BUNDLED}

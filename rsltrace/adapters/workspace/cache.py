@@ -106,6 +106,3 @@ def _root() -> Path:
         atexit.register(shutil.rmtree, scratch, ignore_errors=True)
         return Path(scratch)
     return root / "rsltrace"
-
-
-__all__ = ["cached_folder", "key_of", "lasting", "same_place"]

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from glob import glob
 from itertools import pairwise
@@ -153,6 +154,16 @@ class _VariableScope:
             scope = scope.outer
         return None
 
+    @contextmanager
+    def restored(self, names: Iterable[str]) -> Iterator[None]:
+        """Give these variables the values afterwards that they have now."""
+        before = {name: self.values.get(name) for name in names}
+        yield
+        for name, value in before.items():
+            self.values.pop(name, None)
+            if value is not None:
+                self.values[name] = value
+
 
 class _CMakeInterpreter:
     """Follows the commands of one package."""
@@ -247,13 +258,10 @@ class _CMakeInterpreter:
             return
         else:
             items = rest
-        before = self._scope.values.get(name)
-        for item in items:
-            self._scope.values[name] = item
-            self._run(body)
-        self._scope.values.pop(name, None)
-        if before is not None:
-            self._scope.values[name] = before
+        with self._scope.restored([name]):
+            for item in items:
+                self._scope.values[name] = item
+                self._run(body)
 
     # -- commands --------------------------------------------------------------------------------
 
@@ -289,13 +297,9 @@ class _CMakeInterpreter:
             self._run(body)
             self._scope = outer
         else:
-            before = {key: outer.values.get(key) for key in given}
-            outer.values |= given
-            self._run(body)
-            for key, value in before.items():
-                outer.values.pop(key, None)
-                if value is not None:
-                    outer.values[key] = value
+            with outer.restored(given):
+                outer.values |= given
+                self._run(body)
         self._depth -= 1
 
     def _do_project(self, words: list[str]) -> None:
@@ -413,12 +417,9 @@ class _CMakeInterpreter:
     def _do_include(self, words: list[str]) -> None:
         file = self._folder / words[0]
         if is_expanded(words[0]) and file.is_file() and file.is_relative_to(self._top):
-            before = self._scope.values.get("CMAKE_CURRENT_LIST_DIR")
-            self._scope.values["CMAKE_CURRENT_LIST_DIR"] = str(file.parent)
-            self.run_file(file)
-            self._scope.values.pop("CMAKE_CURRENT_LIST_DIR")
-            if before is not None:
-                self._scope.values["CMAKE_CURRENT_LIST_DIR"] = before
+            with self._scope.restored(["CMAKE_CURRENT_LIST_DIR"]):
+                self._scope.values["CMAKE_CURRENT_LIST_DIR"] = str(file.parent)
+                self.run_file(file)
 
     # -- values ----------------------------------------------------------------------------------
 
@@ -547,6 +548,3 @@ def _below(file: Path, folder: Path) -> str:
         return str(file.relative_to(folder))
     except ValueError:
         return str(file)
-
-
-__all__ = ["CMakeCommand", "commands", "is_expanded"]

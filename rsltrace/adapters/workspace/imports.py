@@ -389,14 +389,3 @@ def _exchange(stack: ExitStack, real: Callable[..., Any], ours: Callable[..., An
         if getattr(module, name, None) is real:
             stack.callback(setattr, module, name, real)
             setattr(module, name, ours)
-
-
-__all__ = [
-    "UnbuiltWorkspace",
-    "made_when_imported",
-    "unbuilt_executables",
-    "unbuilt_names",
-    "unbuilt_packages",
-    "unbuilt_prefix",
-    "unbuilt_programs",
-]

@@ -172,17 +172,6 @@ def _console_scripts(package: SourcePackage) -> dict[str, str]:
     return {name: target.partition("[")[0].strip() for name, target in found.items()}
 
 
-__all__ = [
-    "compiled_executables",
-    "executables",
-    "installed_files",
-    "module_folders",
-    "modules",
-    "share_prefix",
-    "unknown_installs",
-]
-
-
 # Lays out what a package would have installed below ``share``, as links to its sources.
 #
 # Everything lies where it lies in the package's folder (``config``, ``launch``, ``urdf``), and

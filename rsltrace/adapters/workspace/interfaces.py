@@ -8,7 +8,6 @@ uses, and kept in a cache, under the content of the package's files.
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from rsltrace.adapters.workspace.bundled import BUNDLED, is_bundled
 from rsltrace.adapters.workspace.cache import cached_folder, key_of
 from rsltrace.adapters.workspace.generate import READY
 from rsltrace.errors import JobError, SetupError
+from rsltrace.job.reading.substitute import package_prefix
 from rsltrace.source_packages import SourcePackage
 from rsltrace.terminal import tell
 
@@ -261,12 +261,8 @@ def _no_such_type(package: str, written: str, name: str) -> str:
 
 
 def _installed_share(name: str) -> Path | None:
-    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
-    for prefix in filter(None, prefixes):
-        share = Path(prefix) / "share" / name
-        if share.is_dir():
-            return share
-    return None
+    prefix = package_prefix(name)
+    return None if prefix is None else prefix / "share" / name
 
 
 def _versions() -> str:
@@ -351,6 +347,3 @@ def _templates() -> Path | None:
     share = _installed_share("rosidl_generator_py")
     folder = None if share is None else share / "resource"
     return folder if folder is not None and (folder / "_idl.py.em").is_file() else None
-
-
-__all__ = ["EXPORTS", "InterfaceMaker", "interface_makers", "module_name", "used_types"]

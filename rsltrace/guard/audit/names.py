@@ -13,6 +13,7 @@ from rsltrace.guard.audit.scopes import (
     ImportedName,
     ModuleSource,
     NameScope,
+    is_self,
 )
 from rsltrace.guard.rules import RULES
 
@@ -44,7 +45,7 @@ class NameResolver:
             )
         if isinstance(node, ast.Attribute):
             owner = scope.own_class
-            if owner is not None and _is_self(node.value):
+            if owner is not None and is_self(node.value):
                 found = owner.attributes.get(node.attr) or owner.names.get(node.attr)
                 if found:
                     bound = ((one, owner) for one in found)
@@ -85,7 +86,7 @@ class NameResolver:
         bound: list[tuple[Binding, NameScope]] = []
         if isinstance(node, ast.Name):
             bound = list(self.bindings(node, scope))
-        elif isinstance(node, ast.Attribute) and scope.own_class and _is_self(node.value):
+        elif isinstance(node, ast.Attribute) and scope.own_class and is_self(node.value):
             bound = [(one, scope) for one in scope.own_class.attributes.get(node.attr, [])]
         return depth < _DEPTH_MAX and any(
             self.is_made_by(one, scope.module.scope_of(one), makers, depth + 1, seen)
@@ -233,7 +234,3 @@ def _evaluated_in(binding: Binding, scope: NameScope) -> NameScope:
     if isinstance(binding, ast.expr) and binding in scope.module.parents:
         return scope.module.scope_of(binding)
     return scope
-
-
-def _is_self(node: ast.expr) -> bool:
-    return isinstance(node, ast.Name) and node.id in ("self", "cls")

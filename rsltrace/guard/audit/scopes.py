@@ -97,7 +97,6 @@ _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
 def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> ModuleSource:
-    """Return a module with its scopes."""
     module = ModuleSource(name, is_package, tree)
     for parent in ast.walk(tree):
         for child in ast.iter_child_nodes(parent):
@@ -126,7 +125,7 @@ class _Binder(ast.NodeVisitor):
             self.scope.names[target.id].append(value)
         elif isinstance(target, ast.Attribute):
             owner = self.scope.own_class
-            if owner is not None and _is_self(target.value):
+            if owner is not None and is_self(target.value):
                 owner.attributes[target.attr].append(value)
         elif isinstance(target, ast.Starred):
             self._bind(target.value, None)
@@ -225,7 +224,7 @@ class _Binder(ast.NodeVisitor):
             self.scope.names[name] = self.module.top.names[name]
 
 
-def _is_self(node: ast.expr) -> bool:
+def is_self(node: ast.expr) -> bool:
     return isinstance(node, ast.Name) and node.id in ("self", "cls")
 
 

@@ -286,7 +286,6 @@ class RawDescriptor(io.RawIOBase):
         self.mode = ("rb+" if self._writes else "rb") if self._reads else "wb"
 
     def fileno(self) -> int:
-        """Return the descriptor."""
         if self.closed:
             raise ValueError("I/O operation on closed file")
         return self._fd
@@ -300,7 +299,6 @@ class RawDescriptor(io.RawIOBase):
         return self._writes
 
     def seekable(self) -> bool:
-        """Return whether it has positions."""
         try:
             os.lseek(self.fileno(), 0, os.SEEK_CUR)
         except OSError:
@@ -312,7 +310,6 @@ class RawDescriptor(io.RawIOBase):
         return os.lseek(self.fileno(), offset, whence)
 
     def isatty(self) -> bool:
-        """Return whether it is a terminal."""
         return os.isatty(self.fileno())
 
     def readinto(self, buffer: Any, /) -> int | None:

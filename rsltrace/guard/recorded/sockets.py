@@ -48,24 +48,29 @@ def _recorded_of(sock: Any, frame: FrameType) -> Guard | None:
 
 
 def _answer(
-    guard: Guard, sock: Any, call: str, real: Callable[[], Any], frame: FrameType, *, waits: bool
+    guard: Guard,
+    sock: Any,
+    call: str,
+    real: Callable[[], Any],
+    frame: FrameType,
+    *,
+    waits: bool,
+    tls: Any = None,
 ) -> Any:
-    number = guard.descriptors.number(sock)
-    if not waits or not guard.context.is_aside() or sock.gettimeout() == 0:
+    """``tls``: a TLS socket is not readable while decrypted bytes are left."""
+    number, timeout_s = guard.descriptors.number(sock), sock.gettimeout()
+    if not waits or not guard.context.is_aside() or timeout_s == 0:
         return guard.record(NondeterminismSource.SOCKET, call, real, frame, number)
-    timeout_s = sock.gettimeout()
-    look = wait_readable(sock.fileno(), lambda: [real()])
+    wire = wait_readable(sock.fileno(), lambda: [real()])
+
+    def look(seconds: float) -> Any:
+        return [real()] if tls is not None and tls.pending() else wire(seconds)
+
     found = wait_recorded(
-        guard,
-        NondeterminismSource.SOCKET,
-        call,
-        look,
-        frame,
-        number=number,
-        timeout_s=timeout_s,
+        guard, NondeterminismSource.SOCKET, call, look, frame, number=number, timeout_s=timeout_s
     )
     if found is None:
-        raise TimeoutError("timed out")
+        raise TimeoutError("timed out" if tls is None else "The read operation timed out")
     return found[0]
 
 
@@ -158,7 +163,7 @@ def _reading(real: Callable[..., Any]) -> Any:
 
         owner, call = self.owner, "TLS.read()"
         if isinstance(owner, socket.socket):
-            data = _answer_tls(guard, self, owner, call, receive, frame)
+            data = _answer(guard, owner, call, receive, frame, waits=True, tls=self)
         else:
             data = guard.record(NondeterminismSource.SOCKET, call, receive, frame)
         if buffer is None:
@@ -167,32 +172,6 @@ def _reading(real: Callable[..., Any]) -> Any:
         return len(data)
 
     return read
-
-
-def _answer_tls(
-    guard: Guard,
-    tls: Any,
-    sock: socket.socket,
-    call: str,
-    receive: Callable[[], Any],
-    frame: FrameType,
-) -> Any:
-    """Wait for a TLS socket, which is not readable while decrypted bytes are left."""
-    number = guard.descriptors.number(sock)
-    timeout_s = sock.gettimeout()
-    if timeout_s == 0 or not guard.context.is_aside():
-        return guard.record(NondeterminismSource.SOCKET, call, receive, frame, number)
-    wire = wait_readable(sock.fileno(), lambda: [receive()])
-
-    def look(seconds: float) -> Any:
-        return [receive()] if tls.pending() else wire(seconds)
-
-    found = wait_recorded(
-        guard, NondeterminismSource.SOCKET, call, look, frame, number=number, timeout_s=timeout_s
-    )
-    if found is None:
-        raise TimeoutError("The read operation timed out")
-    return found[0]
 
 
 def _pending(real: Any) -> property:

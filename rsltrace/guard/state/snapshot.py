@@ -64,7 +64,6 @@ class _Leaves:
         self.arrays: _Arrays = {}
 
     def add(self, value: Any, path: str) -> None:
-        """Add a value with all its parts."""
         if len(self.found) >= LEAVES_MAX:
             raise _TooMany
         if isinstance(value, np.ndarray) and value.dtype.kind in "biufcmM":

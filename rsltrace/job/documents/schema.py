@@ -255,6 +255,3 @@ def _parameter() -> Schema:
     }
     arrays = [{"type": "array", "minItems": 1, "items": item} for item in scalars]
     return {"description": "A ROS parameter", "anyOf": [*scalars, *arrays, below]}
-
-
-__all__ = ["attached", "field_schema", "file_default", "job_schema", "summary"]

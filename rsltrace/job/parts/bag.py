@@ -48,7 +48,6 @@ class QosSpec(JobPart):
     )
 
     def values(self) -> dict[str, str | int]:
-        """Return what is given."""
         names = ("reliability", "durability", "history", "depth")
         return {name: value for name in names if (value := getattr(self, name)) is not None}
 

@@ -240,16 +240,11 @@ class CheckSpec(JobPart):
 
     @property
     def kind(self) -> str:
-        """The one of ``KINDS`` that is given."""
         return next(kind for kind in self.KINDS if getattr(self, kind) is not None)
 
     @after_fields
     def _says_one_thing(self) -> None:
-        given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
-        if len(given) != 1:
-            what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise JobProblem(f"give one of {', '.join(self.KINDS)}: {what}")
-        (kind,) = given
+        kind = self._only(self.KINDS)
         if kind == "rate" and self.at_least is None and self.at_most is None:
             raise JobProblem("how often? Give at_least or at_most (9 Hz)", ("rate",))
         for keys, kinds in (

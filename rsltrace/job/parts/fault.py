@@ -230,7 +230,6 @@ class FaultSpec(JobPart):
 
     @property
     def kind(self) -> str:
-        """The one of ``ONE_OF`` that is given."""
         return next(kind for kind in self.ONE_OF if getattr(self, kind) is not None)
 
     @property
@@ -240,7 +239,6 @@ class FaultSpec(JobPart):
 
     @property
     def of_node(self) -> bool:
-        """Whether it is about a node."""
         return self.kind in self.OF_NODES
 
     @property
@@ -255,10 +253,7 @@ class FaultSpec(JobPart):
 
     @after_fields
     def _says_one_thing(self) -> None:
-        given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
-        if len(given) != 1:
-            what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}: {what}")
+        self._only(self.ONE_OF)
         for key, field, kinds in (
             ("at", self.at_ns, self.OF_NODES),
             ("event", self.event, self.OF_NODES),
@@ -286,10 +281,7 @@ class FaultSpec(JobPart):
             return
         if self.field is None:
             raise JobProblem(f"what changes? Give field: a field of {self.change}", ("change",))
-        given = [key for key in self.CHANGES if getattr(self, key) is not None]
-        if len(given) != 1:
-            what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise JobProblem(f"give one of {', '.join(self.CHANGES)}: {what}", ("field",))
+        self._only(self.CHANGES, ("field",))
 
     def _says_when(self) -> None:
         if not self.of_node:

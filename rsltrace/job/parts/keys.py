@@ -17,7 +17,6 @@ class LaterPart:
 
     @classmethod
     def model(cls) -> type[Fielded]:
-        """Return the part."""
         found: type[Fielded] = getattr(import_module(cls.HOME), cls.__name__)
         return found
 

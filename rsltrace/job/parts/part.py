@@ -8,7 +8,7 @@ name (``duration_ns=``).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import UnionType
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, Union, get_args, get_origin
 
@@ -200,6 +200,14 @@ class JobPart(Fielded):
                 data = {**data, key: _counted(data[name])}
                 del data[name]
         return data
+
+    def _only(self, keys: Sequence[str], at: tuple[str, ...] = ()) -> str:
+        """Return which of ``keys`` is given; it is a problem (``at``) if that is not one."""
+        given = [key for key in keys if getattr(self, key) is not None]
+        if len(given) != 1:
+            what = f"{' and '.join(given)} are given" if given else "none is given"
+            raise JobProblem(f"give one of {', '.join(keys)}: {what}", at)
+        return given[0]
 
     def replace(self, **changes: object) -> Self:
         """Return a copy with ``changes`` (keys as in the constructor), validated again."""

@@ -115,7 +115,6 @@ class SettingSpec(JobPart):
 
     @property
     def kind(self) -> str:
-        """The one of ``ONE_OF`` that is given."""
         return next(kind for kind in self.ONE_OF if getattr(self, kind) is not None)
 
     @after_fields

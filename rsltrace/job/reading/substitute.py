@@ -202,8 +202,13 @@ def _error(item: YamlValue, written: str, message: str) -> JobError:
 
 def package_prefix(package: str) -> Path | None:
     """Return the prefix a package is installed in: ament's, or that of wheels."""
-    entries = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    for prefix in [*filter(None, entries), sys.prefix]:
-        if package and (Path(prefix) / "share" / package).is_dir():
-            return Path(prefix)
+    for prefix in installed_prefixes():
+        if package and (prefix / "share" / package).is_dir():
+            return prefix
     return None
+
+
+def installed_prefixes() -> list[Path]:
+    """Return the prefixes in which ROS packages are installed: ament's, and that of wheels."""
+    listed = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    return [Path(folder) for folder in [*filter(None, listed), sys.prefix]]

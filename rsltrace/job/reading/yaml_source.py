@@ -79,7 +79,6 @@ class YamlSource:
         return f"\n{gutter}{shown.rstrip()}\n{' ' * (len(gutter) - 2)}| {before}^"
 
     def error(self, message: str, mark: TextPosition) -> JobError:
-        """Return the error that ``message`` is wrong at ``mark``."""
         return JobError(f"{message}{self.excerpt(mark)}", where=self.where(mark))
 
 

@@ -17,14 +17,11 @@ from rsltrace.run.plans.bags import (
     PLAYER,
     BagInput,
     check_bag_types,
-    check_type,
     open_bag_of,
-    qos_override,
-    qos_values,
+    played_streams,
     run_start_ns,
     with_progress,
 )
-from rsltrace.trace.recordings.playback import Playback
 
 _SETTLED_S = 0.5
 _SETTLED_WITHIN_S = 30.0
@@ -49,25 +46,18 @@ def _play(job: Job, bags: list[BagInput]) -> None:
 
     rclpy.init(args=[])
     node = Node(PLAYER, start_parameter_services=False, enable_rosout=False)
-    publishers: dict[tuple[str, str], Any] = {}
-    streams: list[_Played] = []
-    for entry in bags:
-        ends = []
-        for topic in entry.bag.topics:
-            key = entry.name_of(topic), topic.type_name
-            if key not in publishers:
-                qos = {**qos_values(topic.qos), **qos_override(entry.spec, topic.name)}
-                kind = check_type(entry.spec.path, topic)
-                publishers[key] = node.create_publisher(kind, key[0], _profile(qos))
-            ends.append(publishers[key])
-        streams.append(_messages(entry.playback, ends))
+
+    def publisher(topic: str, kind: type, qos: dict[str, Any]) -> Any:
+        return node.create_publisher(kind, topic, _profile(qos))
+
+    streams, publishers = played_streams(bags, publisher)
     merged: _Played = heapq.merge(*streams, key=lambda message: message[0])
     if job.progress is not None:
         kind = get_message_class("std_msgs/msg/Float32")
         progress = node.create_publisher(kind, job.progress, 10)
-        publishers[job.progress, ""] = progress
+        publishers.append(progress)
         merged = with_progress(merged, progress, bags)
-    _wait_for_listeners(list(publishers.values()))
+    _wait_for_listeners(publishers)
     _publish(merged, run_start_ns(job, bags))
     node.destroy_node()
     rclpy.try_shutdown()
@@ -80,11 +70,6 @@ def _publish(messages: _Played, start_ns: int) -> None:
         left_ns = stamp_ns - start_ns - (time.monotonic_ns() - begun_ns)
         time.sleep(max(left_ns, 0) / 1e9)
         publisher.publish(bytes(data))
-
-
-def _messages(playback: Playback, publishers: list[Any]) -> _Played:
-    for stamp_ns, topic, data in playback.messages():
-        yield stamp_ns, publishers[topic], data
 
 
 def _wait_for_listeners(publishers: list[Any]) -> None:

@@ -24,7 +24,7 @@ from rsltrace.adapters.rclpy.boundary.installation import native_extension
 from rsltrace.adapters.rclpy.callback_errors import exit_status
 from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.errors import JobError, RsltraceError
-from rsltrace.native.callback_observer import failure_of
+from rsltrace.native.callback_observer import failure_of, make_executor
 from rsltrace.native.native_run import ENDS_WITHIN_S, rclpy_running
 from rsltrace.native.observed_entities import ObservedEntity
 from rsltrace.native.priorities import Priorities
@@ -224,13 +224,8 @@ class _EntryProcess:
 
     def _make_executor(self) -> Any:
         if self._priorities is not None and self._entry is not None:
-            from rsltrace.native.callback_observer import PriorityExecutor
-
             threading.current_thread().name = f"rsltrace {self._entry.entry.name}"
-            return PriorityExecutor(self._priorities)
-        import rclpy.executors
-
-        return getattr(rclpy.executors, self._order.executor)()
+        return make_executor(self._order.executor, self._priorities)
 
     def _ended(self, one: RunningEntry, error: BaseException | None) -> None:
         if isinstance(error, JobError):

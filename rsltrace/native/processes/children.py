@@ -162,5 +162,4 @@ class ObservedProcess(threading.Thread):
             os.killpg(self.number, number)
 
     def kill(self) -> None:
-        """Kill the process with all that it has started."""
         kill_group(self._process.pid)

@@ -166,7 +166,6 @@ class ProcessObservers:
         self._stack = ExitStack()
 
     def watch(self) -> None:
-        """Begin."""
         executors = CallbackObserver(
             self.recorder, self.entities, self.message_observer, self.nodes.meet
         )

@@ -21,14 +21,13 @@ from rsltrace.adapters.rclpy.boundary.installation import native_extension
 from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 from rsltrace.child_processes import how_ended
-from rsltrace.errors import JobError, NodeError, RsltraceError, RunError
+from rsltrace.errors import JobError, RsltraceError, RunError
 from rsltrace.native.callback_observer import EXECUTORS
 from rsltrace.native.native_run import (
     ENDS_WITHIN_S,
     LOOK_EVERY_S,
     NativeResult,
     NativeRun,
-    ProcessorTime,
 )
 from rsltrace.native.processes.children import ObservedProcess, ProcessStart
 from rsltrace.native.processes.plans import start_rules, starts_of
@@ -402,19 +401,7 @@ class MultiProcessRun(NativeRun):
             if kind not in _QUIET_ENDS:
                 self.notes.append(f"{child.what.name}, told to end, raised {kind}: {said}")
             return
-        reason = f"{what} raised {kind}"
-        stamp_ns = self.clocks.stamp(time.monotonic_ns())
-        name = child.what.name
-        self.fail(
-            NodeError(
-                f"{reason}: {said}",
-                node=node,
-                entity=name,
-                stamp_ns=stamp_ns,
-                traceback_text=traceback,
-            ),
-            reason,
-        )
+        self.raised(what, child.what.name, node, kind, said, traceback)
 
     def _ended(self, child: ObservedProcess, status: int) -> None:
         """Take note of the end of a process."""
@@ -590,7 +577,11 @@ class MultiProcessRun(NativeRun):
             sum(one[place] for one in self._counts.values()) for place in (2, 3, 4)
         )
         return self.close(
-            ended_after, stuck, unreadable, ProcessorTime(cpu_ns - beside_ns, beside_ns)
+            ended_after,
+            stuck,
+            unreadable,
+            callbacks_ns=cpu_ns - beside_ns,
+            beside_ns=beside_ns,
         )
 
     def _kill_all(self) -> None:

@@ -127,7 +127,6 @@ class Link:
         return frame
 
     def close(self) -> None:
-        """Close this end."""
         self._socket.close()
 
 
@@ -148,7 +147,6 @@ class SpanEncoder:
         return [(one.id, one.node, int(one.kind), one.name) for one in self._entities.news()]
 
     def plain(self, span: CallbackSpan) -> tuple[Any, ...]:
-        """Return a span as plain values."""
         span.index = next(self._numbers)
         cause = None
         if span.cause is not None and span.cause[0].index >= 0:

@@ -40,7 +40,6 @@ class ResponseBound:
 
 
 def bounds(system: TaskSystem) -> list[ResponseBound]:
-    """Return the bound of each task of a system."""
     return _BoundSolver(system).solve()
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import heapq
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import BagError, SetupError
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from rsltrace.trace.recordings import Bag
     from rsltrace.trace.recordings.playback import Playback
     from rsltrace.trace.recordings.topic import BagTopic, StoredTopic
+
+_Messages = Iterator[tuple[int, Any, bytes]]
+"""Simulated time, publisher and bytes of messages that play."""
 
 PLAYER = "rosbag2_player"
 """The node that publishes what bags have, named as ``ros2 bag play`` names its own."""
@@ -229,7 +233,7 @@ def start_players(
 
     domain = world.domain
     faults = BagFaults(job, is_open=is_open)
-    streams: list[Iterator[tuple[int, Any, bytes]]] = []
+    streams: list[_Messages] = []
     progress_publishers: list[Any] = []
 
     def publisher(node: NodeHandle, topic: str, cls: type, qos: dict[str, Any]) -> Any:
@@ -239,20 +243,7 @@ def start_players(
 
     def build() -> None:
         player = Node(PLAYER, start_parameter_services=False, enable_rosout=False)
-        publishers: dict[tuple[str, str], Any] = {}
-        for entry in bags:
-            ends = []
-            for topic in entry.bag.topics:
-                key = (entry.name_of(topic), topic.type_name)
-                if key not in publishers:
-                    publishers[key] = publisher(
-                        player.handle,
-                        key[0],
-                        check_type(entry.spec.path, topic),
-                        {**qos_values(topic.qos), **qos_override(entry.spec, topic.name)},
-                    )
-                ends.append(publishers[key])
-            streams.append(_messages(entry.playback, ends))
+        streams.extend(played_streams(bags, partial(publisher, player.handle))[0])
         if job.progress is not None:
             progress = get_message_class("std_msgs/msg/Float32")
             progress_publishers.append(publisher(player.handle, job.progress, progress, {}))
@@ -279,7 +270,26 @@ def start_players(
     return faults
 
 
-def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, Any, bytes]]:
+def played_streams(
+    bags: list[BagInput], publisher: Callable[[str, type, dict[str, Any]], Any]
+) -> tuple[list[_Messages], list[Any]]:
+    """Return the messages of each bag with their publishers, and these: one for each name and type,
+    which ``publisher(topic, class, QoS)`` makes."""
+    publishers: dict[tuple[str, str], Any] = {}
+    streams = []
+    for entry in bags:
+        ends = []
+        for topic in entry.bag.topics:
+            key = (entry.name_of(topic), topic.type_name)
+            if key not in publishers:
+                qos = {**_qos_values(topic.qos), **_qos_override(entry.spec, topic.name)}
+                publishers[key] = publisher(key[0], check_type(entry.spec.path, topic), qos)
+            ends.append(publishers[key])
+        streams.append(_messages(entry.playback, ends))
+    return streams, list(publishers.values())
+
+
+def _messages(playback: Playback, publishers: list[Any]) -> _Messages:
     for stamp_ns, topic, data in playback.messages():
         yield stamp_ns, publishers[topic], data
 
@@ -291,9 +301,7 @@ def _span_ns(bags: list[BagInput]) -> tuple[int, int]:
     return min(entry.playback.start_ns for entry in bags), max(end for end in ends if end)
 
 
-def with_progress(
-    messages: Iterator[tuple[int, Any, bytes]], publisher: Any, bags: list[BagInput]
-) -> Iterator[tuple[int, Any, bytes]]:
+def with_progress(messages: _Messages, publisher: Any, bags: list[BagInput]) -> _Messages:
     """Insert progress messages from 0 to 1, at each full percent."""
     start_ns, end_ns = _span_ns(bags)
     last_percent, stamp_ns = -1, start_ns
@@ -311,14 +319,14 @@ def _float32(percent: int) -> bytes:
     return b"\x00\x01\x00\x00" + struct.pack("<f", percent / 100)
 
 
-def qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:
+def _qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:
     for glob, qos in spec.qos.items():
         if fnmatchcase(topic, glob):
             return qos.values()
     return {}
 
 
-def qos_values(qos: Any) -> dict[str, Any]:
+def _qos_values(qos: Any) -> dict[str, Any]:
     """Return the known policies of a recorded QoS."""
     if qos is None:
         return {}

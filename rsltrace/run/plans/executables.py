@@ -32,6 +32,7 @@ from rsltrace.errors import JobError, nearest
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.virtual.user_modules import code_of_script
 from rsltrace.job import Job, NodeSpec
+from rsltrace.job.reading.substitute import installed_prefixes
 from rsltrace.run.plans.scheduling import load_target
 from rsltrace.run.process import run_as_main, user_modules
 from rsltrace.simulation.middleware.events.failure import exception_text
@@ -337,16 +338,10 @@ def _console_scripts(package: str) -> dict[str, str]:
     return found
 
 
-def _prefixes() -> list[Path]:
-    """Return the prefixes in which ROS packages are installed."""
-    listed = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    return [Path(folder) for folder in [*listed, sys.prefix] if folder]
-
-
 def _installed_files(package: str) -> dict[str, Path]:
     """Return the executable files of a ROS package, by name."""
     found: dict[str, Path] = {}
-    for prefix in _prefixes():
+    for prefix in installed_prefixes():
         folder = prefix / "lib" / package
         if not (prefix / "share/ament_index/resource_index/packages" / package).exists():
             continue
@@ -362,7 +357,7 @@ def _packages() -> set[str]:
 
     names = {dist.name for dist in metadata.distributions() if dist.name}
     names |= {name.replace("-", "_") for name in names}
-    for prefix in _prefixes():
+    for prefix in installed_prefixes():
         index = prefix / "share/ament_index/resource_index/packages"
         names |= {path.name for path in index.iterdir()} if index.is_dir() else set()
     return names
@@ -377,7 +372,6 @@ def _did_you_mean_or(name: str, names: Iterable[str], word: str) -> str:
 
 
 def _python_script(path: Path, target: str, where: str) -> MainProgram:
-    """Return a Python script to run."""
     with path.open("rb") as file:
         first = file.readline(256)
     if is_compiled(path):

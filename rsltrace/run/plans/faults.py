@@ -63,7 +63,6 @@ def field_changer(message_class: type, spec: FaultSpec) -> Callable[[bytes], byt
 
 
 def _type_at(spec: MessageSpec, steps: tuple[Step, ...]) -> FieldType:
-    """Return the type of the field at a path."""
     kind: FieldType = spec
     before = ""
     for name, place in steps:
@@ -237,7 +236,6 @@ class BagFaults:
         self.add(job, 0)
 
     def add(self, job: Job, first: int) -> None:
-        """Add the faults of a job from number ``first`` on."""
         for index, spec in enumerate(job.faults[first:], start=first):
             if spec.of_bag:
                 assert spec.message is not None

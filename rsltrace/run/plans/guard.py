@@ -176,7 +176,6 @@ class RunGuard:
         return tuple(GuardCount(*key, count) for key, count in sorted(counts.items()))
 
     def write(self, writer: TraceWriter) -> None:
-        """Write the summary into the trace."""
         summary = {}
         if self.counts:
             summary["calls"] = counts_text(self.counts)

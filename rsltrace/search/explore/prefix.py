@@ -42,6 +42,13 @@ def take_ends(tell: int, say: int) -> int:
     return fcntl.fcntl(tell, fcntl.F_DUPFD_CLOEXEC, _HIGH)
 
 
+def lead_nowhere(number: int) -> None:
+    """Let a descriptor be that of the null device."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nowhere, number)
+    os.close(nowhere)
+
+
 def answer_and_end(run: Callable[[], dict[str, Any]], tell: int) -> None:
     """Write the answer of a run, or its error, and end this process."""
     status = 1
@@ -67,7 +74,6 @@ def answer_and_end(run: Callable[[], dict[str, Any]], tell: int) -> None:
 
 
 def source_of(task: dict[str, Any]) -> JobSource:
-    """Return the job of a task."""
     job = task["job"]
     return JobSource(**{**job, "overrides": tuple((one, two) for one, two in job["overrides"])})
 
@@ -166,9 +172,7 @@ def _serve_forks(
     from rsltrace.guard.guard import engage
 
     lines.move_high()
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 2)
-    os.close(nowhere)
+    lead_nowhere(2)
     kept = [number for number, _, _ in open_descriptors()]
     try:
         with ExitStack() as stack:

@@ -27,7 +27,13 @@ from rsltrace.forking import die_with_parent, other_threads
 from rsltrace.guard.libraries import is_library
 from rsltrace.guard.pin import pin
 from rsltrace.line_protocol import Lines
-from rsltrace.search.explore.prefix import Prefixes, answer_and_end, source_of, take_ends
+from rsltrace.search.explore.prefix import (
+    Prefixes,
+    answer_and_end,
+    lead_nowhere,
+    source_of,
+    take_ends,
+)
 from rsltrace.search.explore.trial import CRASH, TIMEOUT, Failure, Trial, TrialResult
 
 _PIECE_BYTES = 1 << 16
@@ -50,7 +56,7 @@ def main(words: list[str]) -> None:
     lines = Lines(socket.socket(fileno=int(words[0])))
     lines.move_high()  # the descriptors that nodes get are those of any run
     for number in (0, 1):
-        _lead_nowhere(number)
+        lead_nowhere(number)
     is_warm = "--cold" in words
     gc.collect()
     gc.freeze()
@@ -226,12 +232,6 @@ def _make(task: dict[str, Any], tell: int, *, tells: bool) -> None:
         return answer
 
     answer_and_end(run, tell)
-
-
-def _lead_nowhere(number: int) -> None:
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    os.dup2(nowhere, number)
-    os.close(nowhere)
 
 
 if __name__ == "__main__":

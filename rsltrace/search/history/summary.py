@@ -73,7 +73,6 @@ class JobHistory:
     fails_now: bool = False
 
     def add(self, run: RunRecord) -> None:
-        """Count a run."""
         self.runs += 1
         self.seconds += run.seconds or 0.0
         if run.by == "explore" and run.verdict != "error":
@@ -158,7 +157,6 @@ class _Table:
         self._series_of, self._commit_of, self._fails = array("i"), array("i"), array("b")
 
     def add(self, run: RunRecord) -> None:
-        """Add a run."""
         job = self._jobs.get(run.job)
         if job is None:
             job = self._jobs[run.job] = JobHistory(run.job)
@@ -173,7 +171,6 @@ class _Table:
         self._fails.append(run.verdict != "passed")
 
     def summary(self, skipped: int) -> HistorySummary:
-        """Return what the runs say."""
         times, commits = np.array(self._times), np.array(self._commit_of)
         series, names = [*self._series], [*self._commits]
         before, after = self._changes(times)

@@ -86,7 +86,6 @@ def share(part: int, whole: int) -> str:
 
 
 def commit_text(commit: str) -> str:
-    """Return a commit in short."""
     oid, dash, rest = commit.partition("-")
     short = shortened(f"{oid[:_COMMIT_DIGITS]}{dash}{rest}", 2 * _COMMIT_DIGITS)
     return printable(short) or "unknown"

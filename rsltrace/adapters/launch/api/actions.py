@@ -12,10 +12,10 @@ from rsltrace.adapters.launch.api.basics import (
     Condition,
     LaunchContext,
     as_substitutions,
+    missing_package,
     visit_all,
 )
 from rsltrace.adapters.launch.api.description_sources import LaunchDescriptionSource
-from rsltrace.adapters.launch.api.packages import missing_package
 from rsltrace.adapters.launch.model import truth
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import parse_time
@@ -175,17 +175,3 @@ class LogInfo(Action):
 
     def execute(self, context: LaunchContext) -> None:
         """Do nothing."""
-
-
-__all__ = [
-    "IfCondition",
-    "IncludeLaunchDescription",
-    "LaunchConfigurationEquals",
-    "LaunchConfigurationNotEquals",
-    "LogInfo",
-    "MissingModuleError",
-    "OpaqueCoroutine",
-    "OpaqueFunction",
-    "TimerAction",
-    "UnlessCondition",
-]

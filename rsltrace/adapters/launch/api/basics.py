@@ -37,7 +37,6 @@ class Substitution:
         return type(self).__name__
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the text."""
         raise NotImplementedError(f"{type(self).__name__} has no perform()")
 
 
@@ -153,7 +152,6 @@ class LaunchContext:
         return self.scope.environment
 
     def perform_substitution(self, substitution: Substitution) -> str:
-        """Return what a substitution stands for."""
         return substitution.perform(self)
 
     def text(self, given: Any) -> str:
@@ -180,7 +178,6 @@ class Condition:
         self._predicate_func = predicate
 
     def evaluate(self, context: LaunchContext) -> bool:
-        """Return whether it holds."""
         return True if self._predicate_func is None else bool(self._predicate_func(context))
 
 
@@ -188,7 +185,6 @@ class LaunchDescriptionEntity:
     """Anything that a launch description holds."""
 
     def visit(self, context: LaunchContext) -> None:
-        """Do it, and what it brings."""
         raise NotImplementedError(f"{type(self).__name__} has no visit()")
 
     def inside(self) -> Iterable[Any]:
@@ -265,7 +261,6 @@ class LaunchDescription(LaunchDescriptionEntity):
 
 
 def visit_all(context: LaunchContext, entities: Any) -> None:
-    """Do the entities of a sequence."""
     for entity in entities:
         if not isinstance(entity, LaunchDescriptionEntity):
             raise TypeError(
@@ -340,24 +335,3 @@ def as_job_error(error: BaseException, where: str) -> JobError:
     name = type(error).__name__
     said = _missing_file(error) or (f"{name}: {said}" if said else name)
     return JobError(said, where=where)
-
-
-__all__ = [
-    "NOWHERE",
-    "WHY",
-    "Action",
-    "Condition",
-    "LaunchContext",
-    "LaunchDescription",
-    "LaunchDescriptionEntity",
-    "Substitution",
-    "SubstitutionFailure",
-    "TextSubstitution",
-    "as_job_error",
-    "as_substitutions",
-    "calling_line",
-    "missing_package",
-    "perform_substitutions",
-    "shown",
-    "visit_all",
-]

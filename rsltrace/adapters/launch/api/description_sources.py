@@ -7,7 +7,7 @@ from importlib.machinery import SourceFileLoader
 from types import ModuleType
 from typing import Any
 
-from rsltrace.adapters.launch.api.basics import LaunchContext, LaunchDescription, Substitution
+from rsltrace.adapters.launch.api.basics import LaunchDescription, Substitution
 
 
 class LaunchDescriptionSource:
@@ -77,16 +77,3 @@ def get_launch_description_from_python_launch_file(
         raise ValueError("there is no function generate_launch_description() in the launch file")
     found: LaunchDescription = module.generate_launch_description()
     return found
-
-
-__all__ = [
-    "AnyLaunchDescriptionSource",
-    "FrontendLaunchDescriptionSource",
-    "LaunchContext",
-    "LaunchDescriptionSource",
-    "PythonLaunchDescriptionSource",
-    "XMLLaunchDescriptionSource",
-    "YAMLLaunchDescriptionSource",
-    "get_launch_description_from_python_launch_file",
-    "load_python_launch_file_as_module",
-]

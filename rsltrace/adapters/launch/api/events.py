@@ -210,29 +210,3 @@ class UnregisterEventHandler(Action):
 
     def execute(self, context: LaunchContext) -> None:
         context.refuse(self.where, "UnregisterEventHandler", "event handlers stay as they are here")
-
-
-__all__ = [
-    "ChangeState",
-    "EmitEvent",
-    "Event",
-    "EventHandler",
-    "OnExecutionComplete",
-    "OnProcessExit",
-    "OnProcessIO",
-    "OnProcessStart",
-    "OnShutdown",
-    "OnStateTransition",
-    "ProcessExited",
-    "ProcessIO",
-    "ProcessStarted",
-    "RegisterEventHandler",
-    "Shutdown",
-    "ShutdownAction",
-    "ShutdownProcess",
-    "SignalProcess",
-    "StateTransition",
-    "UnregisterEventHandler",
-    "later",
-    "matches_action",
-]

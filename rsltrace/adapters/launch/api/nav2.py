@@ -158,6 +158,3 @@ def _is_true(text: str) -> bool:
         return truth(text)
     except ValueError:
         return False
-
-
-__all__ = ["HasNodeParams", "LaunchConfigAsBool", "ReplaceString", "RewrittenYaml"]

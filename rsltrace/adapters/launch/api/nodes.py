@@ -294,7 +294,6 @@ class ComposableNodeContainer(Node):
             component.note(context, self.full_name(context))
 
     def full_name(self, context: LaunchContext) -> str:
-        """Return its name with its namespace."""
         values = self._values or self._description.values(context, self.where)
         return full_name(values["namespace"], values["name"] or "")
 
@@ -330,14 +329,3 @@ def _words(context: LaunchContext, given: Any) -> tuple[str, ...]:
 
 def _number(context: LaunchContext, value: Any) -> float:
     return float(value if isinstance(value, (int, float)) else context.text(value))
-
-
-__all__ = [
-    "ComposableNode",
-    "ComposableNodeContainer",
-    "ExecuteLocal",
-    "ExecuteProcess",
-    "LifecycleNode",
-    "LoadComposableNodes",
-    "Node",
-]

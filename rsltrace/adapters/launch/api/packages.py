@@ -20,7 +20,6 @@ from rsltrace.adapters.launch.api.basics import (
     WHY,
     LaunchContext,
     calling_line,
-    missing_package,
 )
 from rsltrace.job.reading.substitute import package_prefix
 
@@ -41,17 +40,12 @@ def prefix_of(package: str) -> str:
         from ament_index_python.packages import get_package_prefix
     except ImportError:
         prefix = package_prefix(package)
-        return _nowhere(package) if prefix is None else str(prefix)
+        return NOWHERE if prefix is None else str(prefix)
     return str(get_package_prefix(package))
 
 
 def share_of(package: str) -> str:
-    """Return the ``share`` folder of a package."""
     return os.path.join(prefix_of(package), "share", package)
-
-
-def _nowhere(package: str) -> str:
-    return NOWHERE
 
 
 @contextmanager
@@ -80,7 +74,7 @@ def missing_packages_allowed(context: LaunchContext) -> Iterator[None]:
                     f"{context.where or calling_line()}: there is no package {package_name!r}: "
                     f"{WHY}; what wants something of it is left out"
                 )
-            return _nowhere(package_name)
+            return NOWHERE
 
     def get_package_share_directory(package_name: str, print_warning: bool = True) -> str:
         return os.path.join(get_package_prefix(package_name), "share", package_name)
@@ -108,12 +102,3 @@ def _is_caught_by_caller() -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-__all__ = [
-    "missing_package",
-    "missing_packages_allowed",
-    "names_missing_package",
-    "prefix_of",
-    "share_of",
-]

@@ -14,8 +14,8 @@ from rsltrace.adapters.launch.api.basics import (
     LaunchContext,
     Substitution,
     as_substitutions,
+    missing_package,
 )
-from rsltrace.adapters.launch.api.packages import missing_package
 from rsltrace.adapters.launch.model import typed, yaml_value
 from rsltrace.adapters.launch.parameter_files import parameters_for, substituted_parameters
 from rsltrace.adapters.launch.substitution import parse_template
@@ -198,13 +198,3 @@ def evaluated_parameters(
         else:
             file = given if isinstance(given, ParameterFile) else ParameterFile(given)
             yield file.found(context, full_name)
-
-
-__all__ = [
-    "Parameter",
-    "ParameterFile",
-    "ParameterValue",
-    "evaluated_parameters",
-    "parameter_value",
-    "plain_value",
-]

@@ -34,13 +34,17 @@ _ROOTS = ("launch", "launch_ros", "launch_xml", "launch_yaml", "nav2_common")
 _WORD = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 
-def _all(*modules: ModuleType) -> dict[str, Any]:
-    return {name: getattr(module, name) for module in modules for name in module.__all__}
+def _all(module: ModuleType) -> dict[str, Any]:
+    """Return the classes of a module by name."""
+    return {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type) and value.__module__ == module.__name__ and name[0] != "_"
+    }
 
 
-def _these(names: str, *modules: ModuleType) -> dict[str, Any]:
-    known = _all(*modules)
-    return {name: known[name] for name in names.split()}
+def _these(names: str, module: ModuleType) -> dict[str, Any]:
+    return {name: getattr(module, name) for name in names.split()}
 
 
 _ROS_SETTINGS = "SetParameter SetParametersFromFile SetRemap SetROSLogDir SetUseSimTime"
@@ -48,6 +52,9 @@ _ROS_SUBSTITUTIONS = "ExecutableInPackage FindPackagePrefix FindPackageShare"
 _PROCESS_EVENTS = "ProcessExited ProcessIO ProcessStarted ShutdownProcess SignalProcess"
 _HANDLERS = "OnExecutionComplete OnProcessExit OnProcessIO OnProcessStart OnShutdown"
 _DESCRIPTIONS = _these("Parameter ParameterFile ParameterValue", parameters)
+_SOURCE_FUNCTIONS = (
+    "get_launch_description_from_python_launch_file load_python_launch_file_as_module"
+)
 _SOURCE = "AnyLaunchDescriptionSource LaunchDescriptionSource"
 
 _MODULES: dict[str, dict[str, Any]] = {
@@ -72,13 +79,17 @@ _MODULES: dict[str, dict[str, Any]] = {
     "launch.conditions": _all(conditions),
     "launch.substitutions": {
         **_all(substitutions),
-        "SubstitutionFailure": basics.SubstitutionFailure,
+        **_these("SubstitutionFailure TextSubstitution", basics),
     },
     "launch.events": _these("Event Shutdown matches_action", events),
     "launch.events.process": _these(_PROCESS_EVENTS, events),
     "launch.events.matchers": _these("matches_action", events),
     "launch.event_handlers": _these(_HANDLERS, events),
-    "launch.launch_description_sources": _all(sources),
+    "launch.launch_description_sources": {
+        **_all(sources),
+        **_these(_SOURCE_FUNCTIONS, sources),
+        "LaunchContext": basics.LaunchContext,
+    },
     "launch.utilities": {
         "normalize_to_list_of_substitutions": basics.as_substitutions,
         "perform_substitutions": basics.perform_substitutions,
@@ -190,6 +201,3 @@ def own_launch() -> Iterator[None]:
         yield
     finally:
         sys.meta_path.remove(finder)
-
-
-__all__ = ["own_launch"]

@@ -271,22 +271,3 @@ class SetROSLogDir(Action):
 
     def execute(self, context: LaunchContext) -> None:
         """Do nothing."""
-
-
-__all__ = [
-    "AppendEnvironmentVariable",
-    "DeclareLaunchArgument",
-    "GroupAction",
-    "PushRosNamespace",
-    "ResetEnvironment",
-    "ResetLaunchConfigurations",
-    "SetEnvironmentVariable",
-    "SetLaunchConfiguration",
-    "SetParameter",
-    "SetParametersFromFile",
-    "SetROSLogDir",
-    "SetRemap",
-    "SetUseSimTime",
-    "UnsetEnvironmentVariable",
-    "UnsetLaunchConfiguration",
-]

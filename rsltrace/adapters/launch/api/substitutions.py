@@ -17,7 +17,6 @@ from rsltrace.adapters.launch.api.basics import (
     LaunchContext,
     Substitution,
     SubstitutionFailure,
-    TextSubstitution,
     as_substitutions,
 )
 from rsltrace.adapters.launch.api.packages import prefix_of, share_of
@@ -358,31 +357,3 @@ class ExecutableInPackage(FindExecutable):
         """Return the path it has, or would have."""
         package = context.text(self.package)
         return os.path.join(prefix_of(package), "lib", package, context.text(self.name))
-
-
-__all__ = [
-    "AllSubstitution",
-    "AndSubstitution",
-    "AnonName",
-    "AnySubstitution",
-    "Command",
-    "EnvironmentVariable",
-    "EqualsSubstitution",
-    "ExecutableInPackage",
-    "FileContent",
-    "FindExecutable",
-    "FindPackagePrefix",
-    "FindPackageShare",
-    "IfElseSubstitution",
-    "LaunchConfiguration",
-    "NotEqualsSubstitution",
-    "NotSubstitution",
-    "OrSubstitution",
-    "PathJoinSubstitution",
-    "PathSubstitution",
-    "PythonExpression",
-    "StringJoinSubstitution",
-    "TextSubstitution",
-    "ThisLaunchFile",
-    "ThisLaunchFileDir",
-]

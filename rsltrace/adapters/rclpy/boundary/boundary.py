@@ -12,8 +12,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rsltrace.adapters.rclpy.actions.action_handle import ActionClientHandle, GoalHandle
-from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
 from rsltrace.adapters.rclpy.arguments import (
     InvalidArgumentsError,
     RosArguments,
@@ -21,6 +19,11 @@ from rsltrace.adapters.rclpy.arguments import (
 )
 from rsltrace.adapters.rclpy.boundary import extension
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
+from rsltrace.adapters.rclpy.handles.actions import (
+    ActionClientHandle,
+    ActionServerHandle,
+    GoalHandle,
+)
 from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable, set_invalid_handle

@@ -83,7 +83,6 @@ class EntryStarts:
             later.schedule_if_met()
 
     def remove_started(self, later: DelayedStart) -> None:
-        """Remove an entry that has started."""
         self._waiting.remove(later)
         self.runtime.programs.to_come.remove(later.entry.key)
 
@@ -131,7 +130,6 @@ class DelayedStart:
                 self.schedule_if_met()
 
     def schedule_if_met(self) -> None:
-        """Schedule the start if all conditions are met."""
         loop, start_ns = self._starts.runtime.loop, self._starts.start_ns
         if not self.unmet and not self._scheduled and start_ns is not None:
             self._scheduled = True

@@ -276,7 +276,6 @@ class UserThreads:
         self.count = 0
 
     def runs_on(self, stack: greenlet) -> bool:
-        """Return whether a stack is that of a thread."""
         return stack in self.by_stack
 
 

@@ -6,9 +6,7 @@ Nothing of ROS is imported before it is needed.
 from __future__ import annotations
 
 import json
-import os
 import re
-import sys
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
@@ -31,6 +29,7 @@ from rsltrace.adapters.rclpy.messages.message_spec import (
     StringType,
     message_spec,
 )
+from rsltrace.job.reading.substitute import installed_prefixes
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 
 # rosidl installs ``<prefix>/share/<package>/<kind>/<Name>.msg`` (or ``.srv``, ``.action``), the
@@ -109,10 +108,7 @@ def _prefixes(package: str) -> Iterator[Path]:
         # <prefix>/lib/python3.12/site-packages/<package>, or one folder deeper; of packages that
         # are not built: <prefix>/site-packages/<package>; of install-ros --into: <prefix>/<package>
         yield from list(Path(location).parents)[:5]
-    for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        if entry:
-            yield Path(entry)
-    yield Path(sys.prefix)
+    yield from installed_prefixes()
 
 
 # A trace holds the concatenated definition of each topic's type (``ros2msg`` of MCAP): the text of

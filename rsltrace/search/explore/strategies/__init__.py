@@ -1,7 +1,7 @@
 """What a search tries next.
 
-strategy     the interface, and the strategies by their names
-walks        random orders, and PCT
-feedback     orders near those that have shown something new
+strategy     the interface
+named        random orders, PCT, orders near those that have shown something new, other settings
 systematic   all orders that could matter, each once
+faults       random faults
 """

@@ -16,7 +16,7 @@ from rsltrace.errors import ExploreError, TraceError
 from rsltrace.job import Job
 from rsltrace.job.dump import plain_part
 from rsltrace.run.plans.bags import PLAYER
-from rsltrace.search.explore.strategies.strategy import Proposal
+from rsltrace.search.explore.strategies.strategy import Proposal, Strategy
 from rsltrace.search.explore.trial import TrialResult
 from rsltrace.simulation.chance.channel import QUIET_TOPICS
 from rsltrace.simulation.chance.stream import RandomStream
@@ -149,11 +149,8 @@ _SHORTEST_NS = 1_000_000
 _OF_MESSAGES = ("drop", "delay", "duplicate")
 
 
-class FaultWalk:
+class FaultWalk(Strategy):
     """Up to three random faults per run, besides those of the job. Order and seed are the job's."""
-
-    behaviours = False
-    steps = False
 
     def __init__(self, job: Job, seed: int = 0, *, fork_ns: int = -1) -> None:
         """``fork_ns``: the simulated time up to which there are no faults."""
@@ -206,9 +203,6 @@ class FaultWalk:
         self._count(faults)
         why = "; ".join(", ".join(f"{k} {v}" for k, v in fault.items()) for fault in faults)
         return Proposal({"faults": [*self._own, *faults]}, why)
-
-    def learn(self, result: TrialResult) -> TrialResult | None:
-        return None
 
     def recall(self, result: TrialResult) -> None:
         self._count(result.trial.overlay.get("faults", [])[len(self._own) :])

@@ -13,6 +13,7 @@ from typing import Any
 
 from rsltrace.errors import ExploreError, JobError
 from rsltrace.job import Job, locate
+from rsltrace.job.dump import plain_part, plain_value
 from rsltrace.job.parts.vary import SettingSpec, VarySpec
 from rsltrace.run.plans.scheduling import switches_at_lines
 from rsltrace.search.explore.strategies.faults import FaultWalk
@@ -96,7 +97,8 @@ def check_vary(source: JobSource, job: Job) -> None:
         raise ExploreError(f"{source.path} has no vary:, which says what to vary and between what")
     for name, setting in job.vary.settings.items():
         where = locate(job, ("vary", "settings", name))
-        for value in _extremes(setting):
+        ends = _axis(setting) if setting.values else [_value(setting, 0.0), _value(setting, 1.0)]
+        for value in ends:
             try:
                 source.job(Trial(0, {"set": {name: value}}))
             except JobError as error:
@@ -104,17 +106,10 @@ def check_vary(source: JobSource, job: Job) -> None:
                 raise JobError(f"{name} cannot be {value}:\n{said}", where=where) from None
 
 
-def _extremes(setting: SettingSpec) -> list[Any]:
-    """Return the values that show whether a job can have all of them."""
-    if setting.values is not None:
-        return [_plain(value) for value in setting.values]
-    return [_value(setting, 0.0), _value(setting, 1.0)]
-
-
 def _axis(setting: SettingSpec) -> list[Any]:
     """Return the values that a grid has of a setting."""
     if setting.values is not None:
-        return [_plain(value) for value in setting.values]
+        return [plain_value(value, plain_part) for value in setting.values]
     if setting.integers is not None:
         first, last = setting.bounds
         return list(range(int(first), int(last) + 1))
@@ -126,7 +121,7 @@ def _value(setting: SettingSpec, share: float) -> Any:
     """Return the value at a share (0 to 1) of what a setting may be."""
     if setting.values is not None:
         place = min(int(share * len(setting.values)), len(setting.values) - 1)
-        return _plain(setting.values[place])
+        return plain_value(setting.values[place], plain_part)
     first, second = setting.bounds
     if setting.integers is not None:
         return min(int(first) + int(share * (second - first + 1)), int(second))
@@ -141,18 +136,6 @@ def _value(setting: SettingSpec, share: float) -> Any:
     return float(f"{found:.{_DIGITS}g}")  # what a person may type, and exactly what is used
 
 
-def _plain(value: Any) -> Any:
-    """Return a value of a job file as JSON has it."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    for kind in (bool, int, float, str):
-        if isinstance(value, kind):
-            return kind(value)
-    return value
-
-
 # Orders near those that have shown something new: one more departure from one of them.
 
 _TRIES = 20
@@ -160,13 +143,12 @@ _ORDERS_MAX = 2_000
 _NEW_SEEDS = 0.2
 
 
-class Feedback:
+class Feedback(Strategy):
     """Keeps the orders of runs in which something happened that had not happened before (an event
     with its content and its node's state, two events of a node in that order), and departs from
     one of them at one more choice; the newest are taken most often."""
 
     behaviours = True
-    steps = False
 
     def __init__(self, seed: int = 0, *, is_forked: bool = False) -> None:
         """``is_forked``: runs begin as the plain one, with its seed."""
@@ -252,11 +234,8 @@ class Feedback:
 # Random orders: a walk that chooses among all that could run, and PCT with its guarantee.
 
 
-class _ByNumber:
+class _ByNumber(Strategy):
     """A strategy whose trials follow from their numbers."""
-
-    behaviours = False
-    steps = False
 
     def __init__(self, seed: int, after: str | None) -> None:
         """``after``: the simulated time up to which the order is the plain one, and the job's own
@@ -275,10 +254,6 @@ class _ByNumber:
     def begin(self, plain: TrialResult) -> None:
         """See that there is something to choose."""
         choices_left(plain, is_forked=self._after is not None)
-
-    def learn(self, result: TrialResult) -> TrialResult | None:
-        """Learn nothing."""
-        return None
 
 
 class RandomWalk(_ByNumber):
@@ -343,11 +318,8 @@ class PctWalk(_ByNumber):
 # Other settings: the combinations that ``vary:`` of the job describes.
 
 
-class VaryWalk:
+class VaryWalk(Strategy):
     """One combination of settings after the other; order and seed are the job's."""
-
-    behaviours = False
-    steps = False
 
     def __init__(self, job: Job, seed: int = 0) -> None:
         if job.vary is None:
@@ -367,10 +339,6 @@ class VaryWalk:
         self._tried += 1
         why = ", ".join(f"{name} = {value}" for name, value in values.items())
         return Proposal({"set": values}, why)
-
-    def learn(self, result: TrialResult) -> TrialResult | None:
-        """Learn nothing."""
-        return None
 
     def recall(self, result: TrialResult) -> None:
         self._tried += 1
@@ -438,11 +406,9 @@ def _check_forks(name: str, job: Job) -> None:
         )
 
 
-class MixedStrategy:
+class MixedStrategy(Strategy):
     """Several strategies in turn. Those whose trials follow from their numbers, or that always have
     something to propose."""
-
-    steps = False
 
     def __init__(self, strategies: Sequence[Strategy]) -> None:
         self._strategies = tuple(strategies)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from rsltrace.errors import ExploreError
 from rsltrace.search.explore.trial import TrialResult
@@ -16,30 +17,35 @@ class Proposal(NamedTuple):
     why: str
 
 
-class Strategy(Protocol):
+class Strategy(ABC):
     """Chooses what to try. It must be deterministic, so that a search can be resumed and repeated;
     several of its trials may be under way at a time.
 
     ``behaviours`` and ``steps`` say what it needs of results (``TrialResult``).
     """
 
-    behaviours: bool
-    steps: bool
+    behaviours = False
+    steps = False
 
+    @abstractmethod
     def begin(self, plain: TrialResult) -> None:
         """Look at the run of the job as it is, before the first proposal."""
 
+    @abstractmethod
     def propose(self, number: int) -> Proposal | None:
         """Return trial ``number``; None if there is nothing to try until more results come."""
 
     def learn(self, result: TrialResult) -> TrialResult | None:
         """Learn from the result of a trial; return what ``recall`` needs, None if its row is
         enough."""
+        return None
 
+    @abstractmethod
     def recall(self, result: TrialResult) -> None:
         """Learn from a result of a resumed search: what ``learn`` returned, or the row. Called
         after ``begin``, for all results in their order."""
 
+    @abstractmethod
     def coverage(self) -> list[str]:
         """Return sentences for people on what was tried."""
 

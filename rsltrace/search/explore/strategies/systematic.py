@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rsltrace.search.explore.steps import EVERYTHING
-from rsltrace.search.explore.strategies.strategy import Proposal, choices_left
+from rsltrace.search.explore.strategies.strategy import Proposal, Strategy, choices_left
 from rsltrace.search.explore.trial import TrialResult, TrialStep
 
 Touches = Mapping[str, bool]
@@ -63,10 +63,9 @@ class _Order:
     asleep: Mapping[str, Touches]
 
 
-class Systematic:
+class Systematic(Strategy):
     """Tries orders with the fewest departures from the plain one first (``departures_max``)."""
 
-    behaviours = False
     steps = True
 
     def __init__(self, departures_max: int | None = None) -> None:

@@ -1,1 +1,0 @@
-"""Actions: clients, servers and goals, made of services and topics."""

@@ -1,1 +1,0 @@
-"""Terminals that mains read from: what is typed there comes from the job, in simulated time."""
