@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import time
 from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
@@ -449,6 +450,22 @@ def crowd(diff: Diff) -> Diff:
         counts=diff.counts * 20,
         remarks=diff.remarks * 10,
     )
+
+
+@pytest.mark.parametrize(("width", "shown"), [(60, 5), (200, 21)])
+def test_of_many_topics_as_many_are_shown_as_two_lines_hold(width: int, shown: int) -> None:
+    """Trying every number of them would take a minute."""
+    found = nondeterministic().divergences[0]
+    reaches = tuple(AffectedTopic(f"/t{n}", 0, 1) for n in range(5000))
+    diff = dataclasses.replace(
+        nondeterministic(), divergences=(dataclasses.replace(found, reaches=reaches),)
+    )
+    begin = time.process_time()
+    text = render(diff, "text", width=width)
+    assert time.process_time() - begin < 2
+    affects = " ".join(text[text.index("affects /t0") :].split())
+    assert affects.count(" immediately, ", 0, affects.index("more")) == shown
+    assert f" immediately, and {5000 - shown} more" in affects
 
 
 def test_a_longer_context_is_shown() -> None:

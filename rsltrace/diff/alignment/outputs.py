@@ -51,9 +51,10 @@ def _named(outputs: list[OutputRow], keys: Sequence[EntityKey]) -> list[object]:
 def _different(a: list[OutputRow], b: list[OutputRow]) -> Iterator[_Place]:
     contents_a, contents_b = [x[:3] for x in a], [y[:3] for y in b]
     if Counter(contents_a) == Counter(contents_b):
+        first = {content: j for j, content in reversed([*enumerate(contents_b)])}
         for i, content in enumerate(contents_a):
             if content != contents_b[i]:
-                yield i, contents_b.index(content), True
+                yield i, first[content], True
         return
     pairs = list(_paired(a, b))
     alone: dict[tuple[int, int, int], list[int]] = {}
@@ -108,11 +109,9 @@ def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]
         return [] if same and one[2] == other[2] else [*a] if same else [*a, *b]
     if len(a) == len(b) and all(x[:3] == y[:3] for x, y in zip(a, b, strict=True)):
         return []
-    theirs = Counter(output[:3] for output in b)
-    mine = Counter(output[:3] for output in a)
-    result = list(beyond(a, theirs))
+    result = beyond(a, b)
     changed = Counter(output[:2] for output in result)
-    for output in beyond(b, mine):
+    for output in beyond(b, a):
         if changed[output[:2]] > 0:
             changed[output[:2]] -= 1
         else:
@@ -120,10 +119,20 @@ def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]
     return result
 
 
-def beyond(outputs: list[OutputRow], others: Counter[tuple[int, int, int]]) -> Iterator[OutputRow]:
-    """Yield the outputs of which the others have fewer."""
-    left = Counter(others)
-    for output in outputs:
-        left[output[:3]] -= 1
-        if left[output[:3]] < 0:
-            yield output
+def beyond(outputs: list[OutputRow], others: list[OutputRow]) -> list[OutputRow]:
+    """Return the outputs of which the others have fewer."""
+    return [outputs[place] for place in places_beyond(outputs, others)]
+
+
+def places_beyond(outputs: list[OutputRow], others: list[OutputRow]) -> Iterator[int]:
+    """Yield where the outputs stand of which the others have fewer: of three equal ones and two
+    of the others, it is the third."""
+    left: dict[tuple[int, int, int], int] = {}
+    for output in others:
+        left[output[:3]] = left.get(output[:3], 0) + 1
+    for place, output in enumerate(outputs):
+        count = left.get(output[:3], 0)
+        if count:
+            left[output[:3]] = count - 1
+        else:
+            yield place

@@ -8,13 +8,12 @@ from, so that the way back to the root can be shown.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair, mark_inverted
-from rsltrace.diff.alignment.outputs import beyond, different_outputs
+from rsltrace.diff.alignment.outputs import beyond, different_outputs, places_beyond
 from rsltrace.diff.alignment.rows import (
     ACTION,
     BAG,
@@ -104,6 +103,9 @@ class Propagation:
         self._drawn: DivergenceOrigin | None = None
         self._made: dict[int, DivergenceOrigin] = {}
         self._busy: DivergenceOrigin | None = None
+        self._passed_on: dict[tuple[int, bool], tuple[frozenset[int], frozenset[int]]] = {}
+        """By a cause in this block and its run, since one can have thousands of consequences: for
+        what it drew other numbers, and which of its outputs the other run does not have."""
 
     def origin_of(self, item: EventPair) -> DivergenceOrigin | None:
         """Return why an item differs, if it does."""
@@ -125,6 +127,7 @@ class Propagation:
         """Go through a block. ``first``, if given, is the divergence the search has found: it
         is a root whatever else there is, and comes before everything."""
         self._block = block
+        self._passed_on.clear()
         if first is not None:
             self._seed(first)
         for item in block.items:
@@ -367,20 +370,20 @@ class Propagation:
             return True
         if item.inverted and cause.inverted:
             return True
-        nth = rows.cause_output[at - rows.first]
         mine, theirs = (cause.a, cause.b) if rows is a else (cause.b, cause.a)
-        other = b if rows is a else a
-        outputs = rows.outputs(mine)
-        if nth >= len(outputs):
+        nth = rows.cause_output[at - rows.first]
+        if nth >= rows.output_counts[mine - rows.first]:
             return True
+        if (mine, rows.run.of_b) not in self._passed_on:
+            other = b if rows is a else a
+            drawn = frozenset(o[1] for o in self._different_outputs(cause) if o[0] == _DRAW)
+            alone = frozenset(places_beyond(rows.outputs(mine), other.outputs(theirs)))
+            self._passed_on[mine, rows.run.of_b] = drawn, alone
+        drawn, alone = self._passed_on[mine, rows.run.of_b]
         # A delay is drawn for the receiver, an execution time for what ran.
-        drawn = (rows.number[at - rows.first], rows.number[mine - rows.first])
-        if any(o[0] == _DRAW and o[1] in drawn for o in self._different_outputs(cause)):
+        if rows.number[at - rows.first] in drawn or rows.number[mine - rows.first] in drawn:
             return True
-        # Of equal outputs, the second has a counterpart only if the other run sent two.
-        sent = outputs[nth][:3]
-        before = sum(output[:3] == sent for output in outputs[: nth + 1])
-        return before > sum(output[:3] == sent for output in other.outputs(theirs))
+        return nth in alone
 
     # -- what follows ----------------------------------------------------------------------------
 
@@ -462,7 +465,7 @@ class Propagation:
         if not self._moved_by(item):
             return []
         a = self._block.rows_a
-        return list(beyond(a.outputs(item.a), Counter(output[:3] for output in differing)))
+        return list(beyond(a.outputs(item.a), differing))
 
     def _taint(self, owner: int, origin: DivergenceOrigin) -> None:
         if owner:

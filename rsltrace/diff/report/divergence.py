@@ -280,7 +280,9 @@ def _reaches(found: Divergence, width: int) -> Section:
         when = f"after {format_duration(reach.after_ns)}" if reach.after_ns else "immediately"
         moved = f" ({moved_text(reach.moved_ns)})" if reach.moved_ns else ""
         parts.append(f"{printable(reach.topic)} {when}{moved}")
-    for shown in range(len(parts), 0, -1):
+    # Trying all of thousands of topics takes seconds, and a part has more than four characters.
+    most = min(len(parts), _REACHES_LINES * max(width // 4, 1))
+    for shown in range(most, 0, -1):
         more = [f"and {len(parts) - shown} more"] if shown < len(parts) else []
         rows = wrapped(f"affects {', '.join(parts[:shown] + more)}", width, indent="  ")
         if len(rows) <= _REACHES_LINES:
