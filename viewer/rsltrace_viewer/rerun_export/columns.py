@@ -93,7 +93,6 @@ class Clock:
         return events if self.rows is None else self.rows.places_of(events, of_b=self.of_b)
 
     def times(self, stamps_ns: npt.NDArray[Any], events: npt.NDArray[np.int64]) -> Times:
-        """Return the columns of both timelines."""
         return (SIM_TIME, self.array(stamps_ns)), (self.order, pa.array(self.places(events)))
 
     @property
@@ -184,7 +183,6 @@ def vectors(values: npt.NDArray[np.floating[Any]]) -> pa.Array:
 
 
 def constant(value: Any, rows: int, kind: pa.DataType | None = None) -> pa.Array:
-    """Return ``value`` in every row."""
     return pa.repeat(pa.scalar(value, type=kind), rows)
 
 

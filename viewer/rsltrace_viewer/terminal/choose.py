@@ -164,17 +164,14 @@ class ChooseApp(App[list[Path]]):
         self.theme = "textual-light" if light else "textual-dark"
 
     def compose(self) -> ComposeResult:
-        """Make the list."""
         yield Static("Traces and recordings of this folder: which one?")
         yield OptionList(*(Option(Content(self._text(i))) for i in range(len(self._found))))
         yield Static("Enter opens   Space marks one to compare with   q quits")
 
     def on_mount(self) -> None:
-        """Take the first."""
         self.query_one(OptionList).highlighted = 0
 
     def on_resize(self) -> None:
-        """Use the width there is."""
         self._show()
 
     def _text(self, place: int) -> str:
@@ -197,7 +194,6 @@ class ChooseApp(App[list[Path]]):
             options.replace_option_prompt_at_index(number, Content(self._text(number)))
 
     def action_mark(self) -> None:
-        """Mark or unmark."""
         place = self.query_one(OptionList).highlighted
         if place is None:
             return
@@ -208,7 +204,6 @@ class ChooseApp(App[list[Path]]):
         self._show()
 
     def action_move(self, step: int) -> None:
-        """Move in the list."""
         options = self.query_one(OptionList)
         options.action_cursor_down() if step > 0 else options.action_cursor_up()
 

@@ -100,7 +100,6 @@ class Shell(App[None]):
     # Setting up.
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         yield HeaderBar(id="header")
         yield LanesView(id="lanes")
         with Container(id="body"):
@@ -153,7 +152,6 @@ class Shell(App[None]):
 
     @property
     def overview(self) -> OverviewScreen | None:
-        """The overview, if one looks at it."""
         return next((one for one in self.screen_stack if isinstance(one, OverviewScreen)), None)
 
     def _explain(self) -> None:
@@ -186,31 +184,25 @@ class Shell(App[None]):
 
     @property
     def timeline(self) -> Timeline:
-        """The list of events."""
         return self.screen_stack[0].query_one(Timeline)
 
     @property
     def inspector(self) -> Inspector:
-        """The selected event."""
         return self.screen_stack[0].query_one(Inspector)
 
     @property
     def source(self) -> SourceView:
-        """The callback of the selected event."""
         return self.screen_stack[0].query_one(SourceView)
 
     @property
     def lanes(self) -> LanesView:
-        """The overview."""
         return self.screen_stack[0].query_one(LanesView)
 
     @property
     def prompt(self) -> Prompt:
-        """The question line."""
         return self.screen_stack[0].query_one(Prompt)
 
     def _fit(self, width: int, height: int) -> None:
-        """Use the screen there is."""
         screen = self.screen_stack[0]
         screen.set_class(width >= WIDE, "wide")
         screen.set_class(height < 16, "low")
@@ -328,7 +320,6 @@ class Shell(App[None]):
         self._show_footer()
 
     def go(self, place: int, *, remember: bool = True, centre: bool = False) -> None:
-        """Select a place and show everything about it."""
         session = self.session
         if session.empty:
             return
@@ -374,17 +365,14 @@ class Shell(App[None]):
         self.call_after_refresh(self._redraw)
 
     def on_timeline_resized(self) -> None:
-        """Lay the columns out again."""
         self._show_rows()
         if not self.busy:
             self._show_values()
 
     def on_timeline_scrolled(self) -> None:
-        """Say what is in the rows that came into sight."""
         self._show_values()
 
     def on_lanes_view_resized(self) -> None:
-        """Count again."""
         self._show_lanes()
 
     def _redraw(self) -> None:

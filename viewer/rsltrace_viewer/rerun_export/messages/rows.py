@@ -251,7 +251,6 @@ class Waiting:
         return self.rows >= _ROWS_PER_CHUNK or self.bytes >= _BYTES_PER_CHUNK
 
     def joined(self, clock: Clock) -> ComponentRows:
-        """Return all rows."""
         if len(self.parts) == 1:
             arrays = self.parts[0]
         else:

@@ -115,7 +115,6 @@ class Paint:
         return Paint(channels[0] << 24 | channels[1] << 16 | channels[2] << 8 | 255)
 
     def column(self, rows: int) -> pa.Array:
-        """Return it for every row."""
         return constant(self.rgba, rows, pa.uint32())
 
 

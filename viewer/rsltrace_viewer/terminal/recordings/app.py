@@ -65,8 +65,6 @@ def question_of(kind: str, session: RecordingSession) -> Question:
 
 
 class RecordingApp(RecordingShell):
-    """One or two recordings on the screen."""
-
     BINDINGS: ClassVar = [
         Binding(key.keys, key.action, key.help, show=False, priority=key.first)
         for key in RECORDING_KEYS
@@ -89,7 +87,6 @@ class RecordingApp(RecordingShell):
     # Moving.
 
     def on_list_view_moved(self, event: ListView.Moved) -> None:
-        """Show what is under the cursor."""
         self._moved = True
         session = self.session
         if self.focused is self.topics:
@@ -119,7 +116,6 @@ class RecordingApp(RecordingShell):
             self._toggle(message.current)
 
     def on_inspector_chosen(self, event: Inspector.Chosen) -> None:
-        """A line was clicked."""
         self._toggle(event.line)
 
     def _toggle(self, line: Line) -> None:
@@ -132,7 +128,6 @@ class RecordingApp(RecordingShell):
         return not (action in ("ask", "pane") and self.prompt.asking)
 
     def action_pane(self, step: int) -> None:
-        """Go to the next pane."""
         panes: list[Widget] = [self.topics, self.messages, self.message]
         place = panes.index(self.focused) if self.focused in panes else -step
         panes[(place + step) % len(panes)].focus()
@@ -156,14 +151,12 @@ class RecordingApp(RecordingShell):
             self._filter("")
 
     def action_ask(self, kind: str) -> None:
-        """Ask for a search, a filter or a time."""
         if kind != "time" and not self.session.done:
             self._say("still reading: a moment, please")
         else:
             self.prompt.ask(question_of(kind, self.session))
 
     def on_prompt_answered(self, event: Prompt.Answered) -> None:
-        """Do what was asked for."""
         if event.text is None:
             self.topics.focus()
         elif event.kind == "filter":
@@ -185,7 +178,6 @@ class RecordingApp(RecordingShell):
                     self._show_messages()
 
     def first_read(self) -> None:
-        """Go where one wants to be, and filter."""
         if self._start is not None:
             self.session.go_to_message(*self._start)
         elif not self._moved:
@@ -252,11 +244,9 @@ class RecordingApp(RecordingShell):
     # Looking.
 
     def action_plot(self) -> None:
-        """Open the plots."""
         self.push_screen(PlotScreen(RecordingPlots(self.session)))
 
     def action_report(self) -> None:
-        """Show the report on two recordings."""
         from rsltrace_viewer.terminal.screens.report import ReportScreen
 
         if self.session.diff is None:
@@ -265,7 +255,6 @@ class RecordingApp(RecordingShell):
             self.push_screen(ReportScreen(self.session.diff))
 
     def action_yank(self) -> None:
-        """Copy the line one is at."""
         if self.focused is self.message:
             line = self.message.current
             text = "" if line is None else f"{line.label} {line.value}"
@@ -280,15 +269,12 @@ class RecordingApp(RecordingShell):
             self._say("copied")
 
     def action_theme(self) -> None:
-        """Change between dark and light."""
         self.theme = "textual-dark" if self.theme == "textual-light" else "textual-light"
 
     def action_help(self) -> None:
-        """Show all keys."""
         self.push_screen(KeysScreen(recording_keys(two=self.session.two), FIELDS))
 
     async def action_quit(self) -> None:
-        """Leave."""
         self.workers.cancel_all()
         self.exit()
 

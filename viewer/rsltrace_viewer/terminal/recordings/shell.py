@@ -71,7 +71,6 @@ class RecordingShell(App[None]):
         super().notify(printable(message), markup=False, **more)
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         yield HeaderBar(id="header")
         with Container(id="body"):
             with Container(id="lists"):
@@ -82,7 +81,6 @@ class RecordingShell(App[None]):
         yield Static(id="footer")
 
     def on_mount(self) -> None:
-        """Show the topics, and read."""
         self.topics.focus()
         self._fit(self.size)
         self._show_all()
@@ -99,22 +97,18 @@ class RecordingShell(App[None]):
 
     @property
     def topics(self) -> ListView:
-        """The list of topics."""
         return self.screen_stack[0].query_one("#topics", ListView)
 
     @property
     def messages(self) -> ListView:
-        """The messages of the selected topic."""
         return self.screen_stack[0].query_one("#messages", ListView)
 
     @property
     def message(self) -> Inspector:
-        """The selected message."""
         return self.screen_stack[0].query_one(Inspector)
 
     @property
     def prompt(self) -> Prompt:
-        """The question line."""
         return self.screen_stack[0].query_one(Prompt)
 
     # Drawing.
@@ -126,7 +120,6 @@ class RecordingShell(App[None]):
         self.topics.styles.height = min(len(self.session.keys), most) + 1
 
     def on_resize(self, event: events.Resize) -> None:
-        """Use the new size."""
         self._fit(event.size)
         self.call_after_refresh(self._show_all)
 

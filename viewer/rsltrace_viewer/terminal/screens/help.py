@@ -41,14 +41,12 @@ class HelpScreen(ModalScreen[None]):
         self._live = live
 
     def compose(self) -> ComposeResult:
-        """Make the text."""
         with VerticalScroll() as box:
             box.border_title = "rsltrace view: keys"
             box.border_subtitle = "Esc closes, ↓ scrolls"
             yield Static(self.text())
 
     def text(self) -> Content:
-        """Return the text."""
         return help_text(self.app.size.width, two=self._two, live=self._live)
 
 
@@ -61,7 +59,6 @@ class KeysScreen(HelpScreen):
         self._fields = fields
 
     def text(self) -> Content:
-        """Return the text."""
         groups = dict.fromkeys(key.group for key in self._keys)
         blocks = [_keys_block(group, self._keys) for group in groups]
         blocks.append(_filter_block(self._fields, _EXAMPLE_OF_MESSAGES))

@@ -36,20 +36,16 @@ class PickScreen(ModalScreen[int | None]):
         self._choices = choices
 
     def compose(self) -> ComposeResult:
-        """Make the list."""
         with Vertical() as box:
             box.border_title = Content(self._title)
             box.border_subtitle = "Enter chooses, Esc closes"
             yield OptionList(*(Option(Content(choice)) for choice in self._choices))
 
     def action_down(self) -> None:
-        """Move down."""
         self.query_one(OptionList).action_cursor_down()
 
     def action_up(self) -> None:
-        """Move up."""
         self.query_one(OptionList).action_cursor_up()
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Choose."""
         self.dismiss(event.option_index)

@@ -34,8 +34,6 @@ _AXIS = 11
 
 
 class PlotView(Widget):
-    """Draws series in braille with axes."""
-
     COMPONENT_CLASSES: ClassVar[set[str]] = {"plot--axis", "plot--a", "plot--b", "plot--both"}
     DEFAULT_CSS = """
     PlotView { width: 1fr; height: 1fr; background: $background; }
@@ -53,7 +51,6 @@ class PlotView(Widget):
         self._plot: tuple[tuple[int, int], Plot] | None = None
 
     def show(self, title: str, series: list[Series], cursor_s: float | None) -> None:
-        """Show one or two series."""
         self._title, self._series, self._cursor_s = title, series, cursor_s
         self._plot = None
         self.refresh()
@@ -117,7 +114,6 @@ class PlotScreen(Screen[None]):
         self._topic = ""
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         yield Static(id="what")
         with Horizontal():
             yield OptionList()
@@ -186,7 +182,6 @@ class PlotScreen(Screen[None]):
             self._show(f"{printable(choice)} has no numbers", [])
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Show the fields of a topic."""
         choice = self._choices[event.option_index]
         if isinstance(choice, str):
             self._fields_level(choice)
@@ -221,7 +216,6 @@ class PlotScreen(Screen[None]):
             self.dismiss()
 
     def action_move(self, step: int) -> None:
-        """Move in the list."""
         options = self.query_one(OptionList)
         options.action_cursor_down() if step > 0 else options.action_cursor_up()
 

@@ -87,7 +87,6 @@ class FooterBar(Static):
         self._places: list[tuple[int, str]] = []
 
     def show(self, *, two: bool, searching: str, status: str, live: bool = False) -> None:
-        """Show the keys, and a status at the right."""
         status = printable(status)
         width = self.size.width - 2
         room = width - (cells(status) + 2 if status else 0)
@@ -106,7 +105,6 @@ class FooterBar(Static):
         self.update(Content.assemble(*parts), layout=False)
 
     async def on_click(self, event: events.Click) -> None:
-        """Do what the key does that was clicked."""
         for end, action in self._places:
             if event.x - 1 < end:
                 await self.app.run_action(f"app.{action}")

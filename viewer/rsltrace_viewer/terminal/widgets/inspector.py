@@ -22,8 +22,6 @@ _LABEL_MAX = 24
 
 
 class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
-    """Draws lines and has a cursor of its own."""
-
     COMPONENT_CLASSES: ClassVar[set[str]] = {f"inspector--{role.value}" for role in Role} | {
         "inspector--label",
         "inspector--cursor",
@@ -61,17 +59,14 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
 
     @property
     def lines(self) -> list[Line]:
-        """The lines shown."""
         return self._lines
 
     @property
     def page(self) -> int:
-        """How many lines are in sight."""
         return max(self.scrollable_content_region.height, 1)
 
     @property
     def current(self) -> Line | None:
-        """The line under the cursor."""
         return self._drawn[self.cursor][0] if self.cursor < len(self._drawn) else None
 
     def show(self, lines: list[Line], *, top: bool = True) -> None:
@@ -90,7 +85,6 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
             self._refresh_changes(before, first)
 
     def move(self, step: int) -> None:
-        """Move the cursor by lines."""
         self.cursor = max(min(self.cursor + step, len(self._drawn) - 1), 0)
         height = self.page
         if self.cursor < self.scroll_y:
@@ -105,20 +99,16 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
         super().notify_style_update()
 
     def on_resize(self, event: events.Resize) -> None:
-        """Wrap long values again."""
         self._lay_out()
         self.refresh()
 
     def on_focus(self) -> None:
-        """Show the cursor."""
         self.refresh()
 
     def on_blur(self) -> None:
-        """Hide the cursor."""
         self.refresh()
 
     def on_click(self, event: events.Click) -> None:
-        """Open, close or follow what was clicked."""
         place = event.get_content_offset(self)
         row = round(self.scroll_y) + (place.y if place is not None else len(self._drawn))
         if row < len(self._drawn):
@@ -153,7 +143,6 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
         return style
 
     def render_line(self, y: int) -> Strip:
-        """Return line ``y`` of the widget."""
         row = round(self.scroll_y) + y
         width = self.scrollable_content_region.width
         if row >= len(self._drawn):

@@ -94,7 +94,6 @@ class LanesView(Widget, can_focus=True):
 
     @property
     def columns(self) -> int:
-        """How many columns there are for events."""
         return max(self.size.width - self._before_lanes - 1, 1)
 
     @property
@@ -151,7 +150,6 @@ class LanesView(Widget, can_focus=True):
         super().notify_style_update()
 
     def on_resize(self, event: events.Resize) -> None:
-        """Count the columns again."""
         self.post_message(self.Resized())
 
     def on_mouse_down(self, event: events.MouseDown) -> None:
@@ -171,12 +169,10 @@ class LanesView(Widget, can_focus=True):
             self.release_mouse()
 
     def on_mouse_scroll_up(self, event: events.MouseScrollUp) -> None:
-        """Zoom in."""
         event.stop()
         self.post_message(self.Zoomed(1))
 
     def on_mouse_scroll_down(self, event: events.MouseScrollDown) -> None:
-        """Zoom out."""
         event.stop()
         self.post_message(self.Zoomed(-1))
 
@@ -227,7 +223,6 @@ class LanesView(Widget, can_focus=True):
         return max(0, min(names.index(self._own) - room // 2, len(names) - room))
 
     def render_line(self, y: int) -> Strip:
-        """Return a lane, or the axis at the bottom."""
         width = self.size.width
         if self.lanes is None:
             return Strip([Piece(" " * width, self._style("empty"))], width)

@@ -45,8 +45,6 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
     """
 
     class Moved(Message):
-        """The cursor is at another line."""
-
         def __init__(self, line: int) -> None:
             super().__init__()
             self.line = line
@@ -66,7 +64,6 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
 
     @property
     def page(self) -> int:
-        """How many lines are in sight."""
         return max(self.scrollable_content_region.height, 1)
 
     def show(self, source: Callable[[int], Pieces], count: int) -> None:
@@ -88,13 +85,11 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         self.post_message(self.Moved(self.cursor))
 
     def scroll_to_cursor(self) -> None:
-        """Bring the cursor into sight."""
         if not round(self.scroll_y) <= self.cursor < round(self.scroll_y) + self.page:
             wanted = max(self.cursor - self.page // 2, 0)
             self.scroll_to(y=wanted, animate=False, force=True, immediate=True)
 
     def on_key(self, event: events.Key) -> None:
-        """Move, or choose."""
         steps = {
             "down": 1,
             "j": 1,
@@ -116,7 +111,6 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         event.stop()
 
     def on_click(self, event: events.Click) -> None:
-        """Choose the line that was clicked."""
         place = event.get_content_offset(self)
         line = round(self.scroll_y) + (place.y if place is not None else self.count)
         if line < self.count:
@@ -124,11 +118,9 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
             self.post_message(self.Chosen(line))
 
     def on_focus(self) -> None:
-        """Show the cursor."""
         self.refresh()
 
     def on_blur(self) -> None:
-        """Hide the cursor."""
         self.refresh()
 
     def _style(self, name: str) -> Style:
@@ -138,7 +130,6 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         return self.get_component_rich_style(f"list--{name}")
 
     def render_line(self, y: int) -> Strip:
-        """Return line ``y`` of the widget."""
         line = round(self.scroll_y) + y
         width = self.scrollable_content_region.width
         if line >= self.count:

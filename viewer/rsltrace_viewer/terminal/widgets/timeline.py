@@ -79,8 +79,6 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     """
 
     class Picked(Message):
-        """A row was clicked."""
-
         def __init__(self, row: int) -> None:
             super().__init__()
             self.row = row
@@ -104,18 +102,15 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
 
     @property
     def page(self) -> int:
-        """How many rows are in sight."""
         return max(self.scrollable_content_region.height - 1, 1)
 
     @property
     def in_sight(self) -> range:
-        """The rows in sight."""
         top = round(self.scroll_y)
         return range(top, min(top + self.page + 1, self._count))
 
     @property
     def row_width(self) -> int:
-        """Cells of a row."""
         return self.scrollable_content_region.width
 
     def show(self, source: Callable[[int], EventRow], count: int, columns: ColumnLayout) -> None:
@@ -174,7 +169,6 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         super().notify_style_update()
 
     def on_resize(self, event: events.Resize) -> None:
-        """Lay out again."""
         set_virtual_size(self, Size(max(self.row_width, 1), self._count + 1))
         self.post_message(self.Resized())
 
@@ -187,7 +181,6 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         self.call_after_refresh(self.post_message, self.Scrolled())
 
     def on_click(self, event: events.Click) -> None:
-        """Select the row that was clicked."""
         row = round(self.scroll_y) + event.y - 1
         if event.y >= 1 and row < self._count:
             self.post_message(self.Picked(row))
