@@ -472,7 +472,6 @@ class Engine(EventObserver):
         end_process(0)
 
     def _event(self, index: int) -> Message:
-        """Return an event that is known."""
         history = self.ledger.history
         trace = history.trace
         try:

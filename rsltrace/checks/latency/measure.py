@@ -204,7 +204,6 @@ class ChainLatency:
 
     @property
     def inputs(self) -> int:
-        """How many messages begin it."""
         return len(self.found.input_ns)
 
     @property

@@ -127,7 +127,6 @@ def field_text(fields: Sequence[FieldDifference], more_fields: int) -> str:
 
 
 def note_text(note: FieldNote) -> str:
-    """Return what is special about two values."""
     text = _NOTES[note.kind].format(a=note.a, b=note.b)
     return f"{text}: {note.count}" if note.count else text
 
