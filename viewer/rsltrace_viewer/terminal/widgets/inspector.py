@@ -14,7 +14,7 @@ from textual.strip import Strip
 
 from rsltrace_viewer.model.inspector.message_tree import Line, Role
 from rsltrace_viewer.model.view import cells, fit, wrap
-from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
+from rsltrace_viewer.terminal.widgets.bars import line_of, set_virtual_size
 
 _IN_FULL = (Role.NOTE, Role.ERROR, Role.WARNING, Role.DIFFERENCE)
 _VALUE_LINES = 4
@@ -55,7 +55,6 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
         self.cursor = 0
         self._lines: list[Line] = []
         self._drawn: list[tuple[Line, str]] = []
-        self._styles: dict[str, Style] = {}
 
     @property
     def lines(self) -> list[Line]:
@@ -93,19 +92,8 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
             self.scroll_to(y=self.cursor - height + 1, animate=False, force=True, immediate=True)
         self.refresh()
 
-    def notify_style_update(self) -> None:
-        """Forget the styles of the old theme."""
-        self._styles.clear()
-        super().notify_style_update()
-
     def on_resize(self, event: events.Resize) -> None:
         self._lay_out()
-        self.refresh()
-
-    def on_focus(self) -> None:
-        self.refresh()
-
-    def on_blur(self) -> None:
         self.refresh()
 
     def on_click(self, event: events.Click) -> None:
@@ -134,13 +122,7 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
         set_virtual_size(self, Size(width, len(drawn)))
 
     def _style(self, name: str) -> Style:
-        style = self._styles.get(name)
-        if style is None:
-            style = self.get_component_rich_style(f"inspector--{name}")
-            if name == "cursor":
-                style = background_of(style)
-            self._styles[name] = style
-        return style
+        return self.get_component_rich_style(f"inspector--{name}")
 
     def render_line(self, y: int) -> Strip:
         row = round(self.scroll_y) + y
@@ -167,14 +149,8 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
                 Piece(f"{label or gap} " if label or gap else "", self._style("label")),
                 Piece(text, self._style(line.role.value)),
             ]
-        strip = Strip(pieces)
-        if strip.cell_length > width:
-            strip = Strip([*strip.crop(0, width - 1), Piece("…", self._style("label"))])
-        strip = strip.adjust_cell_length(width, self._style("field"))
-        if self.has_focus and row == self.cursor:
-            style = self._style("cursor")
-            return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
-        return strip
+        over = self._style("cursor") if self.has_focus and row == self.cursor else None
+        return line_of(pieces, width, self._style("field"), more=self._style("label"), over=over)
 
     def _refresh_changes(self, before: list[tuple[Line, str]], cursor: int) -> None:
         """Draw what changed: over a slow line every row counts."""

@@ -90,7 +90,6 @@ class LanesView(Widget, can_focus=True):
         self._label_width = 8
         self._names = ShortNames(())
         self._colours: Mapping[str, int] = {}
-        self._styles: dict[str, Style] = {}
 
     @property
     def columns(self) -> int:
@@ -144,11 +143,6 @@ class LanesView(Widget, can_focus=True):
         else:
             self.refresh()
 
-    def notify_style_update(self) -> None:
-        """Forget the styles of the old theme."""
-        self._styles.clear()
-        super().notify_style_update()
-
     def on_resize(self, event: events.Resize) -> None:
         self.post_message(self.Resized())
 
@@ -176,14 +170,6 @@ class LanesView(Widget, can_focus=True):
         event.stop()
         self.post_message(self.Zoomed(-1))
 
-    def on_focus(self) -> None:
-        """Mark the line of times."""
-        self.refresh()
-
-    def on_blur(self) -> None:
-        """Mark the line of times no more."""
-        self.refresh()
-
     def _pick(self, x: int) -> None:
         column = x - self._before_lanes
         if self.lanes is None or not 0 <= column < self.lanes.columns or column == self.cursor:
@@ -207,10 +193,7 @@ class LanesView(Widget, can_focus=True):
             column += step
 
     def _style(self, name: str) -> Style:
-        style = self._styles.get(name)
-        if style is None:
-            style = self._styles[name] = self.get_component_rich_style(f"lanes--{name}")
-        return style
+        return self.get_component_rich_style(f"lanes--{name}")
 
     def _first_lane(self) -> int:
         """Which lane is on top: the selected one stays in sight when there are too many."""

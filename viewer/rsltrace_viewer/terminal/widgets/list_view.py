@@ -13,7 +13,7 @@ from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
-from rsltrace_viewer.terminal.widgets.bars import background_of, node_style, set_virtual_size
+from rsltrace_viewer.terminal.widgets.bars import line_of, node_style, set_virtual_size
 
 STYLES = ("plain", "muted", "title", "good", "error", "warning", "link", "bar")
 Pieces = Sequence[tuple[str, str]]
@@ -117,12 +117,6 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
             self.go(line)
             self.post_message(self.Chosen(line))
 
-    def on_focus(self) -> None:
-        self.refresh()
-
-    def on_blur(self) -> None:
-        self.refresh()
-
     def _style(self, name: str) -> Style:
         if name.startswith(_NODE):
             colour = int(name.removeprefix(_NODE))
@@ -135,11 +129,5 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         if line >= self.count:
             return Strip([Piece(" " * width, self._style("plain"))], width)
         pieces = [Piece(text, self._style(name)) for text, name in self._source(line)]
-        strip = Strip(pieces)
-        if strip.cell_length > width:
-            strip = Strip([*strip.crop(0, width - 1), Piece("…", self._style("muted"))])
-        strip = strip.adjust_cell_length(width, self._style("plain"))
-        if self.has_focus and line == self.cursor:
-            over = background_of(self._style("cursor"))
-            return Strip([Piece(text, (old or over) + over) for text, old, _ in strip], width)
-        return strip
+        over = self._style("cursor") if self.has_focus and line == self.cursor else None
+        return line_of(pieces, width, self._style("plain"), more=self._style("muted"), over=over)
