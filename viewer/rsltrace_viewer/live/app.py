@@ -161,7 +161,7 @@ class LiveApp(ViewerApp):
             self._show_inspector(top=False)
 
     def _supersede(self) -> None:
-        if any(worker.group == "live" and worker.is_running for worker in self.workers):
+        if self.has_worker("live"):
             self.workers.cancel_group(self, "live")
             with suppress(DebugError):
                 self._execution.session.pause()
@@ -193,8 +193,11 @@ class LiveApp(ViewerApp):
 
     def action_escape(self) -> None:
         """Stop what runs; otherwise end the nearest thing that can be ended."""
-        running = any(w.group == "live" and w.is_running for w in self.workers)
-        if running and not self.prompt.asking and self._status.startswith("running"):
+        if (
+            self.has_worker("live")
+            and not self.prompt.asking
+            and self._status.startswith("running")
+        ):
             with suppress(DebugError):
                 self._execution.session.pause()
             return

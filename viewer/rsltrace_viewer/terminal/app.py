@@ -161,10 +161,10 @@ class ViewerApp(Stepping):
         screen = self.screen_stack[0]
         if self.prompt.asking:
             self.prompt.put_aside()
-        elif self._is_running("seek"):
+        elif self.has_worker("seek"):
             self.workers.cancel_group(self, "seek")
             self._say("stopped")
-        elif self._is_running("filter"):
+        elif self.has_worker("filter"):
             self._filter("")
         elif any(screen.has_class(name) for name in _ONLY):
             screen.remove_class(*_ONLY)
@@ -177,9 +177,6 @@ class ViewerApp(Stepping):
             self._filter("")
         elif self._follow is not None:
             self.action_follow()
-
-    def _is_running(self, group: str) -> bool:
-        return any(worker.group == group and worker.is_running for worker in self.workers)
 
     # Looking.
 
@@ -350,9 +347,6 @@ class ViewerApp(Stepping):
         self.copy_to_clipboard(text)
         self._say(f"copied: {shortened(text, 40)}")
 
-    def action_theme(self) -> None:
-        self.theme = "textual-dark" if self.theme == "textual-light" else "textual-light"
-
     def action_help(self) -> None:
         self.push_screen(HelpScreen(two=self.session.b is not None, live=self.live))
 
@@ -451,10 +445,6 @@ class ViewerApp(Stepping):
             await self.run_action(action)
 
         return run
-
-    async def action_quit(self) -> None:
-        self.workers.cancel_all()
-        self.exit()
 
 
 def open_session(a: Path, b: Path | None = None) -> Session:
