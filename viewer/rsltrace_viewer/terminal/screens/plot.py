@@ -29,6 +29,7 @@ from rsltrace_viewer.model.plots.series import (
 )
 from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.terminal.follow import walk
+from rsltrace_viewer.terminal.widgets.list_view import Choices
 
 _AXIS = 11
 
@@ -93,8 +94,6 @@ class PlotScreen(Screen[None]):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,backspace", "back", "back"),
         Binding("q,p", "dismiss", "close"),
-        Binding("j", "move(1)", show=False),
-        Binding("k", "move(-1)", show=False),
     ]
     DEFAULT_CSS = """
     PlotScreen Static { background: $panel; padding: 0 1; height: 1; }
@@ -116,7 +115,7 @@ class PlotScreen(Screen[None]):
     def compose(self) -> ComposeResult:
         yield Static(id="what")
         with Horizontal():
-            yield OptionList()
+            yield Choices()
             with Vertical():
                 yield PlotView(id="plot")
                 yield PlotView(id="difference")
@@ -214,10 +213,6 @@ class PlotScreen(Screen[None]):
             self._top_level(self._topic)
         else:
             self.dismiss()
-
-    def action_move(self, step: int) -> None:
-        options = self.query_one(OptionList)
-        options.action_cursor_down() if step > 0 else options.action_cursor_up()
 
 
 def _words(choice: PlotSource | str) -> str:

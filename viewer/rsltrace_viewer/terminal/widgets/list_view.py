@@ -8,10 +8,12 @@ from typing import ClassVar
 from rich.segment import Segment as Piece
 from rich.style import Style
 from textual import events
+from textual.binding import Binding, BindingType
 from textual.geometry import Size
 from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
+from textual.widgets import OptionList
 
 from rsltrace_viewer.terminal.widgets.bars import line_of, node_style, set_virtual_size
 
@@ -24,6 +26,15 @@ _NODE = "node-"
 def node_piece(text: str, colour: int | None) -> tuple[str, str]:
     """Return a text in the colour of a node, if that has one."""
     return text, "plain" if colour is None else f"{_NODE}{colour}"
+
+
+class Choices(OptionList):
+    """A list of options that ``j`` and ``k`` move in as well."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("j", "cursor_down", show=False),
+        Binding("k", "cursor_up", show=False),
+    ]
 
 
 class ListView(ScrollView, can_focus=True, inherit_bindings=False):
