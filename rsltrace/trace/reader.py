@@ -47,6 +47,7 @@ from rsltrace.trace.index import (
     read_metadata,
     read_summary,
 )
+from rsltrace.trace.mcap.open import open_source
 from rsltrace.trace.mcap.reader import McapSummary, check_data, has_end, read_body, walk_records
 from rsltrace.trace.mcap.records import (
     ENTITY_ID_MAX,
@@ -56,7 +57,7 @@ from rsltrace.trace.mcap.records import (
     parse_channel,
     parse_schema,
 )
-from rsltrace.trace.mcap.source import ByteSource, open_source
+from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, EventRecord, Output, OutputKind
 from rsltrace.trace.model.finding import Finding, GuardCount, GuardMode, parse_counts

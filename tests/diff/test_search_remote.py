@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 import rsltrace
 from rsltrace.errors import SetupError, TraceError, TraceFormatError
+from rsltrace.trace.mcap.open import open_source
 from rsltrace.trace.mcap.remote import BLOCK_BYTES, CACHE_BYTES, RemoteSource
-from rsltrace.trace.mcap.source import FileSource, open_source
+from rsltrace.trace.mcap.source import FileSource
 from rsltrace.trace.reader import Trace
 from tests.range_server import RangeServer
 

@@ -21,8 +21,9 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError
 from rsltrace.search.history.run_record import DIRTY, READER, SUFFIX, RunRecord
+from rsltrace.trace.mcap.open import open_source
 from rsltrace.trace.mcap.remote import filesystem_of
-from rsltrace.trace.mcap.source import ByteSource, open_source, public_address, redacted
+from rsltrace.trace.mcap.source import ByteSource, public_address, redacted
 
 SHOWN_MAX = 100
 """The most jobs, and the most changes, that a summary has."""
