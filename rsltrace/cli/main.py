@@ -52,7 +52,6 @@ class LazyGroup(click.Group):
     """A group whose commands are imported when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names in the order of help."""
         return list(_COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -85,7 +84,6 @@ class LazyGroup(click.Group):
     def main(  # type: ignore[override]  # it never returns
         self, args: Any = None, prog_name: str | None = None, **more: Any
     ) -> NoReturn:
-        """Run the command line and exit."""
         more["standalone_mode"] = False
         sys.exit(status_of(lambda: super(LazyGroup, self).main(args, prog_name, **more)))
 

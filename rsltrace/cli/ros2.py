@@ -27,5 +27,4 @@ class RsltraceCommand(CommandExtension):  # type: ignore[misc]
         )
 
     def main(self, *, parser: Any, args: Any) -> int:
-        """Run rsltrace and exit with its status."""
         main(args.words, prog_name="ros2 rsltrace")

@@ -23,7 +23,6 @@ def schema() -> None:
 
 
 def schema_text() -> str:
-    """Return the JSON Schema of a job file."""
     from rsltrace.job.documents.schema import job_schema
 
     return json.dumps(job_schema(), indent=2)

@@ -18,7 +18,6 @@ core as it is loaded, and that spin before they sleep: a seventh of a short comm
 
 
 def main() -> NoReturn:
-    """Run the command line and exit."""
     # While modules load, Ctrl-C ends the process without a traceback.
     is_pythons = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if is_pythons:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rsltrace_viewer.session import Session
     from rsltrace_viewer.terminal.app import ViewerApp
     from rsltrace_viewer.terminal.follow import RerunFollower
-    from rsltrace_viewer.terminal.recordings.app import RecordingApp
+    from rsltrace_viewer.terminal.recordings import RecordingApp
     from rsltrace_viewer.terminal.screenshot import Shown
 
     from rsltrace.job.values.times import TimeInRun
@@ -150,7 +150,7 @@ def _recordings(
 ) -> RecordingApp:
     """Return the app for bags and native recordings, or one of them beside a trace."""
     from rsltrace_viewer.model.recordings.filter import read_filter
-    from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
+    from rsltrace_viewer.terminal.recordings import RecordingApp, open_recordings
 
     from rsltrace.job.values.times import START
 

@@ -65,7 +65,6 @@ class EventFields:
 
     @classmethod
     def of_event(cls, view: Any) -> EventFields:
-        """Return those of an event."""
         return cls(*(getattr(view, name) for name in cls.__slots__))
 
 
@@ -224,7 +223,6 @@ class _EventVocabulary:
         return lambda scope: node_named(scope.moment, called)
 
     def functions(self) -> list[str]:
-        """Return its name."""
         return ["node"]
 
     def unknown(self, name: str) -> str:

@@ -26,8 +26,6 @@ _SENDS = {
 
 @dataclass
 class IndexCondition(ActiveCondition):
-    """Before the event of a number."""
-
     index: int
 
     def before(self, view: EventView) -> str:
@@ -36,8 +34,6 @@ class IndexCondition(ActiveCondition):
 
 @dataclass
 class NodeCondition(ActiveCondition):
-    """Before an event of a node."""
-
     pattern: str
 
     def before(self, view: EventView) -> str:

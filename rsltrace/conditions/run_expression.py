@@ -94,7 +94,6 @@ class _RunVocabulary:
         return once
 
     def functions(self) -> list[str]:
-        """Return their names."""
         return list(_OF_TOPICS)
 
 

@@ -85,7 +85,6 @@ class _ConditionParser:
         self._at = len(text) - len(text.lstrip())
 
     def read(self) -> EventCondition:
-        """Read all of it."""
         text = self._text
         if not text.strip():
             raise self._wrong("where to stop? Say an event (812), a time (t=2.5s), node /name, …")

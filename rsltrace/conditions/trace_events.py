@@ -87,11 +87,9 @@ class TraceEvent:
         return self._name(outputs[at]), self._message(outputs[at])
 
     def sent(self) -> Sequence[SentOutput]:
-        """Return its outputs, in order."""
         return [self._sent(output) for output in self.outputs]
 
     def findings(self) -> Sequence[str]:
-        """Return what the guard found in it."""
         return [one.source.value for one in self._trace.findings.get(self.index, ())]
 
     def _sent(self, output: Output) -> SentOutput:

@@ -348,7 +348,9 @@ class Engine(EventObserver):
     def _do(self, request: Message) -> None:
         do = request["do"]
         if do == "fork":
-            self._fork_for(request)
+            other = self._forked()
+            if other is not None:
+                self._answer_with(other)
         elif do == "position":
             self._answer(ok=self.position())
         elif do == "pause":
@@ -369,10 +371,8 @@ class Engine(EventObserver):
         else:
             raise DebugError(f"there is no request {do!r}")
 
-    def _fork_for(self, request: Message) -> None:
-        other = self._forked()
-        if other is not None:
-            self._hand_over(other, {"id": self._id, "ok": {"pid": other.pid}})
+    def _answer_with(self, copy: ForkedCopy) -> None:
+        self._hand_over(copy, {"id": self._id, "ok": {"pid": copy.pid}})
 
     def _leave_checkpoint(self) -> None:
         began_s = _cpu_s()
@@ -442,7 +442,7 @@ class Engine(EventObserver):
                 self.lines.send(answer)
             end_process(0)
         assert ours is not None
-        self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
+        self._answer_with(ours)
 
     def _start_debugger(self, request: Message) -> bool:
         """Let a copy call the next callbacks under a debugger; return True in the copy."""
@@ -450,7 +450,7 @@ class Engine(EventObserver):
             raise DebugError(f"nothing follows: {self.over}")
         ours = self._forked()
         if ours is not None:
-            self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
+            self._answer_with(ours)
             return False
         try:
             self._apart_calls = make_debugger(self, request)
@@ -472,7 +472,6 @@ class Engine(EventObserver):
         end_process(0)
 
     def _event(self, index: int) -> Message:
-        """Return an event that is known."""
         history = self.ledger.history
         trace = history.trace
         try:

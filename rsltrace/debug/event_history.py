@@ -49,7 +49,6 @@ class TraceHistory:
 
     @property
     def known(self) -> int:
-        """How many events are known so far."""
         return self._limit
 
     def hashes(self, first: int) -> Iterator[int]:
@@ -201,7 +200,6 @@ class EventLedger(TraceWriter):
         return known
 
     def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
-        """Keep a message until the next event has ended."""
         self._payloads_under_way.append((channel_id, data))
         return len(self._payloads_under_way) - 1
 

@@ -59,8 +59,6 @@ class RunGoal:
 
 
 class AfterNodeEvent(ActiveCondition):
-    """True after each event of one node."""
-
     def __init__(self, node: str) -> None:
         self._node = node
 

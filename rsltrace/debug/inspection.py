@@ -212,7 +212,6 @@ def evaluate(run: StoppedRun, expression: str, node: str | None) -> dict[str, An
 
 
 def short_repr(value: object) -> str:
-    """Return a value's ``repr``, shortened."""
     try:
         return _short.repr(value)
     except Exception as error:

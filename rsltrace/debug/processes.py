@@ -28,8 +28,6 @@ class Lost(DebugError):
 
 
 class SimProcess:
-    """A process of the simulation."""
-
     def __init__(self, lines: Lines, pid: int) -> None:
         self.lines = lines
         self.pid = pid
@@ -89,7 +87,6 @@ class Family:
         return "its process does not answer any more"
 
     def kill(self, process: SimProcess) -> None:
-        """End a process at once."""
         process.lines.close()
         if process.pid not in self._ended:
             with suppress(ProcessLookupError):

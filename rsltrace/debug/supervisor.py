@@ -29,15 +29,15 @@ class Supervisor:
         self._last_number = 0
         self._do: dict[str, Callable[[Message], Any]] = {
             "position": lambda request: self.tree.position,
-            "step": self._step,
+            "step": lambda request: self.tree.run({"until": self._index + _count(request)}),
             "next": self._next,
-            "finish": self._finish,
+            "finish": lambda request: self._forward(until_ns=self.tree.position["stamp_ns"]),
             "run_to": self._run_to,
-            "go_on": self._go_on,
+            "go_on": lambda request: self._forward(),
             "reverse_step": self._reverse_step,
-            "reverse_next": self._reverse_next,
-            "reverse_go_on": self._reverse_go_on,
-            "go_to": self._go_to,
+            "reverse_next": lambda request: self.tree.go_back({"node": self._node(request)}),
+            "reverse_go_on": lambda request: self.tree.go_back({"breakpoints": self._conditions()}),
+            "go_to": lambda request: self.tree.go_to(self._place(request["to"])),
             "break": self._break,
             "clear": self._clear,
             "breakpoints": lambda request: self._conditions(),
@@ -96,9 +96,6 @@ class Supervisor:
     def _forward(self, **goal: Any) -> Message:
         return self.tree.run({"breakpoints": self._conditions(), **goal})
 
-    def _step(self, request: Message) -> Message:
-        return self.tree.run({"until": self._index + _count(request)})
-
     def _next(self, request: Message) -> Message:
         answer = self._forward(node=self._node(request))
         if answer["reason"] == "breakpoint" and answer["breakpoint"]["number"] == 0:
@@ -114,9 +111,6 @@ class Supervisor:
         if event is None or not event["node"]:
             raise DebugError("the last event belongs to no node: give a node")
         return str(event["node"])
-
-    def _finish(self, request: Message) -> Message:
-        return self._forward(until_ns=self.tree.position["stamp_ns"])
 
     def _place(self, place: int | str) -> Message:
         """Return the goal for an index (an int, or digits) or a time of the run."""
@@ -139,9 +133,6 @@ class Supervisor:
             raise DebugError(f"{request['to']} is in the past: go_to goes back")
         return self._forward(**goal)
 
-    def _go_on(self, request: Message) -> Message:
-        return self._forward()
-
     def _reverse_step(self, request: Message) -> Message:
         goal = self._index - _count(request)
         if self.tree.position["is_next"]:
@@ -150,15 +141,6 @@ class Supervisor:
         if goal <= 0:
             answer["reason"] = "begin"
         return answer
-
-    def _go_to(self, request: Message) -> Message:
-        return self.tree.go_to(self._place(request["to"]))
-
-    def _reverse_next(self, request: Message) -> Message:
-        return self.tree.go_back({"node": self._node(request)})
-
-    def _reverse_go_on(self, request: Message) -> Message:
-        return self.tree.go_back({"breakpoints": self._conditions()})
 
     def _sent_by(self, request: Message) -> Message:
         event = self.tree.ask_cursor({"do": "event", "index": int(request["index"])})

@@ -44,7 +44,6 @@ class DiffOptions:
     allow_truncated: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if self.context < 0 or self.window < 1:
             raise TraceError(
                 f"a context of {self.context} events in a window of {self.window} cannot be shown; "
@@ -75,11 +74,9 @@ class DiffOptions:
         )
 
     def wants_topic(self, topic: str) -> bool:
-        """Whether a topic is in the report."""
         return not self.topics or any(fnmatchcase(topic, glob) for glob in self.topics)
 
     def wants_node(self, node: str) -> bool:
-        """Whether a node is in the report."""
         return not self.nodes or any(fnmatchcase(node, glob) for glob in self.nodes)
 
     def _tolerance_globs(self) -> tuple[str, ...]:

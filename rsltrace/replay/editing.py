@@ -412,8 +412,6 @@ class DeferredEvents:
 
 
 class _LaterEvent:
-    """An event that runs later than recorded."""
-
     def __init__(self, dispatcher: Dispatcher, call: EventCall) -> None:
         self._dispatcher = dispatcher
         self._event = call.values()

@@ -153,8 +153,6 @@ def check_edits(edits: Sequence[Edit], trace: Trace) -> None:
 
 
 class _EditParser:
-    """Reads one edit."""
-
     def __init__(self, text: str) -> None:
         self._text = text.strip()
         self._begin = 0
@@ -245,7 +243,6 @@ class _EditParser:
         raise self._at(target, f"an edit is one of {_FORMS}")
 
     def _named(self, root: ast.expr) -> tuple[str, str]:
-        """Return function and name of ``node("/ekf")``."""
         if (
             isinstance(root, ast.Call)
             and isinstance(root.func, ast.Name)

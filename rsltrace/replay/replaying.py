@@ -290,7 +290,6 @@ def _branch(
     place: Path,
     kept: Path | None,
 ) -> ReplayResult:
-    """Compare a branch with the trace it branches from."""
     with Trace.open(place) as branch:
         found = diff_traces(plan.trace, branch, DiffOptions(context=_CONTEXT))
     name = THE_BRANCH if kept is None else str(kept)

@@ -42,7 +42,6 @@ class Occurrences:
         return (self.count - 1) * NS_PER_S / span_ns if span_ns > 0 else None
 
     def add(self, count: int, first_ns: int, last_ns: int) -> None:
-        """Add ``count`` more."""
         self.first_ns = min(self.first_ns, first_ns) if self.count else first_ns
         self.last_ns = max(self.last_ns, last_ns) if self.count else last_ns
         self.count += count
@@ -162,7 +161,6 @@ def check_contents(trace: Trace) -> None:
 
 
 def _hashed(trace: Trace) -> dict[int, _ChannelContents]:
-    """Hash all messages."""
     channels = {i: channel for i, channel in trace.channels.items() if _has_content(channel)}
     found = {i: _ChannelContents() for i in channels}
     for channel_id, stamp_ns, sequence, data in trace.messages_of(frozenset(channels)):
@@ -216,7 +214,6 @@ def _check_messages(
 
 
 def _topic_of(output: Output, sender: Entity) -> tuple[str, str]:
-    """Return the topic and the type of an output."""
     if output.kind is OutputKind.LOG:
         return TOPIC_ROSOUT, "rcl_interfaces/msg/Log"
     if output.kind is OutputKind.REQUEST:

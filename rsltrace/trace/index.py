@@ -168,7 +168,6 @@ class SegmentTable:
     packed: bytes = b""
 
     def column(self, name: str) -> tuple[int, ...]:
-        """Return a column, without numpy."""
         numbers = unpack(f"<{len(self.packed) // 8}Q", self.packed)
         return numbers[SEGMENT_COLUMNS.index(name) :: len(SEGMENT_COLUMNS)]
 

@@ -16,12 +16,10 @@ CUT_AFTER_NS = 2 * NS_PER_S
 
 
 def is_native(trace: Trace) -> bool:
-    """Whether a trace is of a native run."""
     return trace.metadata(METADATA_NATIVE).get("mode") == "native"
 
 
 def run_name(trace: Trace) -> str:
-    """Return the digest of a run, or ``native``."""
     return "native" if is_native(trace) else trace.digest
 
 

@@ -36,8 +36,6 @@ _INDEX_ENTRY = Struct("<QQ")
 
 
 class PayloadReader:
-    """Reads messages of any channel."""
-
     def __init__(self, source: ByteSource, index: TraceIndex) -> None:
         self._source = source
         self._index = index

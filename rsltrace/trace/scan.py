@@ -58,7 +58,6 @@ class _Scanner:
         self._what = "the record"
 
     def run(self) -> TraceIndex:
-        """Walk the file."""
         index, summary = self._index, self._summary
         number = 0
         try:
@@ -98,7 +97,6 @@ class _Scanner:
         return index
 
     def _take(self, opcode: int, span: RecordSpan) -> None:
-        """Add a record. Raises DamageError."""
         if opcode == Opcode.CHUNK:
             self._chunk(span)
             return

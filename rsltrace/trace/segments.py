@@ -168,7 +168,6 @@ class SegmentReader:
         self.cached_outputs = lru_cache(maxsize=_SEGMENTS_CACHED)(self.outputs)
 
     def forget(self) -> None:
-        """Drop the caches."""
         self.cached_events.cache_clear()
         self.cached_outputs.cache_clear()
 
@@ -177,7 +176,6 @@ class SegmentReader:
         return int(np.searchsorted(self._first_events, np.uint64(event), side="right")) - 1
 
     def event(self, segment: int, index: int) -> EventRecord:
-        """Return an event of a segment. Raises TraceError."""
         row = self.cached_events(segment)[index - int(self._first_events[segment])]
         return event_of(row, self._source.name)
 

@@ -109,7 +109,6 @@ class RunHistory:
         return list(zip(*(column.tolist() for column in columns), strict=True))
 
     def made_by(self, entity: int) -> int:
-        """Return the event that created an entity."""
         found = self.outputs_of([entity], OutputKind.ENTITY)
         return found[0][1] if found else 0
 

@@ -94,7 +94,6 @@ class Question:
 
     @cached_property
     def messages(self) -> list[Message]:
-        """All that was sent to the callback, in order."""
         return self.history.messages(self.senders, self.entity.id)
 
     def mismatch(self, sender: Entity) -> tuple[str, str, str] | None:

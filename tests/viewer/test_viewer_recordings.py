@@ -21,7 +21,7 @@ from rsltrace_viewer.model.recordings.plots import RecordingPlots
 from rsltrace_viewer.model.recordings.recording import Pairs, Topic
 from rsltrace_viewer.model.recordings.session import RecordingSession
 from rsltrace_viewer.terminal.choose import ChooseApp
-from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
+from rsltrace_viewer.terminal.recordings import RecordingApp, open_recordings
 from rsltrace_viewer.terminal.screens.help import KeysScreen
 from rsltrace_viewer.terminal.screens.plot import PlotScreen
 from rsltrace_viewer.terminal.screens.report import ReportScreen

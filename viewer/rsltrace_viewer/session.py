@@ -113,11 +113,9 @@ class Session:
 
     @property
     def runs(self) -> dict[str, Run]:
-        """The runs by their names, ``a`` and ``b``."""
         return {"a": self.a} if self.b is None else {"a": self.a, "b": self.b}
 
     def close(self) -> None:
-        """Close the files."""
         self.a.close()
         if self.b is not None:
             self.b.close()
@@ -192,12 +190,10 @@ class Session:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no event at all."""
         return self.view.count == 0
 
     @property
     def nothing(self) -> str:
-        """What to say where there is no event at all."""
         if self.a.trace.complete:
             return "no events in this trace"
         return "no events yet: a run writes some four thousand at a time"
@@ -270,7 +266,6 @@ class Session:
         return node_colours(node.name for run in self.runs.values() for node in run.nodes)
 
     def row(self, row: int) -> EventRow:
-        """Return a row of the event list."""
         place = self.rows.at(row)
         events = self._events(place)
         other, index = events[0]
@@ -371,7 +366,6 @@ class Session:
         return ""
 
     def lines(self) -> list[Line]:
-        """Return the lines of the inspector."""
         here = self.current()
         if here is None:
             return []
@@ -440,7 +434,6 @@ class Session:
         return None if here is None else (int(here[0] is self.b), here[1])
 
     def own_lane(self) -> str:
-        """Return the node of the selected event."""
         here = self.current()
         if here is None:
             return ""
@@ -590,7 +583,6 @@ class Session:
     # Going somewhere.
 
     def go(self, place: int, *, remember: bool = True) -> None:
-        """Select a place, and remember where one was."""
         if remember and place != self.place:
             for event in self._events(self.place)[:1]:
                 self.history.leave(event)
@@ -606,7 +598,6 @@ class Session:
         return None
 
     def toggle_mark(self) -> None:
-        """Mark the selected row, or remove its mark."""
         self.marks.toggle(self._events(self.place))
 
     def next_mark(self, step: int) -> int | None:
@@ -638,7 +629,6 @@ class Session:
     # Words.
 
     def plots(self) -> RunPlots:
-        """Return what can be plotted."""
         from rsltrace_viewer.model.plots.runs import RunPlots
 
         found = self.same("topic")
@@ -662,11 +652,9 @@ class Session:
         ]
 
     def title(self) -> str:
-        """Return the name of what is open."""
         return self.a.name if self.b is None else f"{self.a.name} ↔ {self.b.name}"
 
     def facts(self) -> str:
-        """Return a line of facts about it."""
         runs = list(self.shown.values())
         run = runs[0]
         trace = run.trace

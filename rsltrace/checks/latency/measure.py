@@ -43,7 +43,7 @@ def where_broken(flow: MessageFlow, wanted: ChainSelection) -> str:
         return _of_topics(flow, wanted, graph)
     if first is None or last is None:
         if first is not None:
-            return f"no message was caused by one of {first}{_stored(flow, graph, first)}"
+            return f"no message was caused by one of {first}{_stored(graph, first)}"
         return f"no message of {last} was caused by another one"
     way = _way(graph, first, last)
     what = f"message of {last}" if flow.sink is None else f"callback of {flow.sink}"
@@ -114,7 +114,7 @@ def _break(before: str, hop: Hop) -> str:
     )
 
 
-def _stored(flow: MessageFlow, graph: _Graph, topic: str) -> str:
+def _stored(graph: _Graph, topic: str) -> str:
     nodes = sorted({hop.node for hop in graph.get(topic, ())})
     return f"; {', '.join(nodes)} may make use of the last one: --via {nodes[0]}" if nodes else ""
 
@@ -204,7 +204,6 @@ class ChainLatency:
 
     @property
     def inputs(self) -> int:
-        """How many messages begin it."""
         return len(self.found.input_ns)
 
     @property

@@ -58,14 +58,12 @@ class ChainPaths:
         self._extended: dict[tuple[int, int], int] = {}
 
     def hop(self, hop: Hop) -> int:
-        """Return the number of a hop."""
         number = self._hops.setdefault(hop, len(self.known))
         if number == len(self.known):
             self.known.append(hop)
         return number
 
     def named(self, path: int) -> tuple[Hop, ...]:
-        """Return the hops of a path."""
         return tuple(self.known[hop] for hop in self.hops[path])
 
     def begun(self, hop: int) -> int:

@@ -42,7 +42,6 @@ class CheckReport:
 
     @property
     def violated(self) -> list[CheckResult]:
-        """The checks that failed."""
         return [one for one in self.results if one.verdict == VIOLATED]
 
     def lines(self) -> list[str]:

@@ -32,7 +32,6 @@ class _StandardStream(io.FileIO):
         self._ignores_errors = ignores_errors
 
     def write(self, data: Any, /) -> int:
-        """Write bytes."""
         try:
             return super().write(data) or 0
         except OSError as error:

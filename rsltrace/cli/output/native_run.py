@@ -52,7 +52,6 @@ def run_native(
 
 
 def report_native(result: NativeResult, checked: CheckReport | None, *, as_json: bool) -> None:
-    """Print the result of a native run."""
     error = result.error
     for note in result.notes:
         tell(f"note: {note}")

@@ -61,7 +61,6 @@ def _answer(found: BisectResult) -> str:
 
 
 def as_page(found: BisectResult, repository: GitRepository, kept: tuple[Path, Path]) -> str:
-    """Return the report as a page. Raises TraceError."""
     from rsltrace_viewer.pages.search_page import search_page
 
     rows = [("tried", "\n".join(map(line_of, found.tried)))]
@@ -71,7 +70,6 @@ def as_page(found: BisectResult, repository: GitRepository, kept: tuple[Path, Pa
 
 
 def as_values(found: BisectResult, repository: GitRepository, kept: Kept) -> dict[str, Any]:
-    """Return the result as JSON-compatible values."""
     first = found.first
     return {
         "first": None if first is None else _commit(first),

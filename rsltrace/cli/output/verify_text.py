@@ -71,7 +71,6 @@ def as_page(result: VerifyResult, folder: Path, again: Sequence[str]) -> str:
 
 
 def as_values(result: VerifyResult, folder: Path, again: Sequence[str], *, kept: bool) -> str:
-    """Return the answer as JSON."""
     second = result.trouble or result.other
     difference = None
     if result.trouble is None and result.other is not None:

@@ -61,7 +61,6 @@ class ContentKeys:
         self._elements: dict[tuple[str, int], Any] = {}
 
     def key(self, message: object) -> int:
-        """Return the 64-bit key of a decoded message."""
         parts: list[bytes] = []
         if self._rules.empty:
             _add_all(parts, message)

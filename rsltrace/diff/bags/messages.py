@@ -128,7 +128,6 @@ class _TopicMessages:
         return None if found is None else self._source.decode(self._number, found)
 
     def view(self, index: int, stamps: Keys) -> BagMessage:
-        """Return a message for printing."""
         try:
             message = self.get(index)
             text = "" if message is None else preview(message, _PREVIEW)

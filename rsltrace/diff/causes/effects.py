@@ -77,7 +77,6 @@ class EffectSearch:
         return self.found is None and not self.past_covered and 0 in self._setups
 
     def take(self, block: AlignedBlock, propagation: Propagation) -> None:
-        """Go through a block."""
         if self._roots and not self.going_on:
             return
         first = not self._roots

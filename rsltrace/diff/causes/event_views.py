@@ -25,13 +25,10 @@ _SEGMENTS_BACK = 2
 
 
 class EventViews:
-    """Makes the views of one run's events."""
-
     def __init__(self, run: ComparedTrace) -> None:
         self._run = run
 
     def view(self, index: int) -> EventSummary:
-        """Return event ``index``, which must exist."""
         run = self._run
         event = run.trace.event(index)
         outputs = outputs_of(run, index)

@@ -87,7 +87,6 @@ class _Words:
     """What is not taken over from the trace."""
 
     def command(self) -> str:
-        """Return the line."""
         ros = ["--ros-args", *self.ros, "--"] if self.ros else []
         words = ["rsltrace", "record", *self.job, *self.settings, *self.launch, *ros]
         return " ".join(shlex.quote(word) for word in words)

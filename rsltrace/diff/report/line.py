@@ -14,8 +14,6 @@ from rsltrace.trace.words.phrases import as_sentence
 
 
 class Style:
-    """What a piece is."""
-
     PLAIN = ""
     TITLE = "title"
     GOOD = "good"

@@ -29,5 +29,4 @@ def says(*facts: Any) -> Callable[[_Made], _Made]:
 
 
 def sentence(fact: Any, of: Any = None) -> str:
-    """Return the sentence for a fact."""
     return SENTENCES[fact if isinstance(fact, Enum) else type(fact)](fact, of)

@@ -53,8 +53,6 @@ ALL_HINT = "--all shows them"
 
 
 class RunComparison(Protocol):
-    """What the answer for two runs needs."""
-
     @property
     def outcome(self) -> Outcome:
         """The answer itself."""
@@ -73,7 +71,6 @@ class RunComparison(Protocol):
 
 
 def answer(of: RunComparison) -> str:
-    """Return the answer for two runs."""
     return sentence(of.outcome, of)
 
 

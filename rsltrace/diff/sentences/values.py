@@ -85,9 +85,9 @@ def durations(a_ns: int, b_ns: int) -> str:
     return f"{number} → {b}" if unit == other_unit else f"{a} → {b}"
 
 
-def pair_text(a: str | None, b: str | None, nothing: str = "nothing") -> str:
+def pair_text(a: str | None, b: str | None) -> str:
     """Return ``old → new``, in which one sees what differs."""
-    one, other = contrasting_texts(nothing if a is None else a, nothing if b is None else b)
+    one, other = contrasting_texts("nothing" if a is None else a, "nothing" if b is None else b)
     return f"{one} → {other}"
 
 
@@ -127,7 +127,6 @@ def field_text(fields: Sequence[FieldDifference], more_fields: int) -> str:
 
 
 def note_text(note: FieldNote) -> str:
-    """Return what is special about two values."""
     text = _NOTES[note.kind].format(a=note.a, b=note.b)
     return f"{text}: {note.count}" if note.count else text
 

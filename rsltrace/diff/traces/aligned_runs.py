@@ -62,7 +62,6 @@ class AlignedRuns:
         return next(self._blocks, None)
 
     def take(self, block: Block | None) -> None:
-        """Add the rows of a block (None: there is no more)."""
         if block is None:
             self.done = True
             return

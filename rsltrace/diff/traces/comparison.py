@@ -131,7 +131,6 @@ class _TraceComparison:
         """See ``RunsDiverge``."""
 
     def run(self) -> Diff:
-        """Return the answer."""
         if self._only_names and self._a.complete and self._b.complete:
             return self._same_but_for_names()
         over = who_ended(self._a, self._b, self._start)
@@ -361,7 +360,6 @@ class _EventCounts:
         self._ended = False
 
     def take(self, block: AlignedBlock) -> None:
-        """Count the items of a block."""
         for item in block.items:
             rows, index = (block.rows_a, item.a) if item.a >= 0 else (block.rows_b, item.b)
             counts = self._counts.setdefault(rows.number[index - rows.first], [0, 0, 0, 0])

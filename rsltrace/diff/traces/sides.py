@@ -9,7 +9,6 @@ from rsltrace.trace.reader import Trace
 
 
 def stop_reason(trace: Trace) -> str:
-    """Return why a run ended, in words."""
     if not trace.complete:
         return "interrupted"
     return trace.result.get("stop_reason") or "no reason given"

@@ -54,8 +54,6 @@ class NodeOutput:
 
 
 class NodeOutputs:
-    """The outputs of a node in a trace."""
-
     def __init__(self, trace: Trace, puts: Sequence[NodeOutput]) -> None:
         self.trace, self.puts = trace, puts
 
@@ -146,7 +144,6 @@ def _event(put: NodeOutput | None) -> int | None:
 def _pairs(
     recorded: Sequence[NodeOutput], present: Sequence[NodeOutput]
 ) -> list[tuple[NodeOutput | None, NodeOutput | None]]:
-    """Pair the outputs of two recordings, in order."""
     waiting: dict[tuple[Key, int], list[NodeOutput]] = {}
     for put in present:
         waiting.setdefault((put.key, put.at), []).append(put)

@@ -251,7 +251,6 @@ class RecordedScript:
         return self._present.get(entity, -1)
 
     def match_entity(self, entity: Entity, node: str) -> None:
-        """Match a new entity with a recorded one."""
         key = (node, entity.kind, entity.name)
         recorded = self._recorded.get((key, self._counts[key]))
         self._counts[key] += 1

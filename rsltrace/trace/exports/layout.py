@@ -93,12 +93,9 @@ def export_layout(
 
 @dataclass(slots=True)
 class _Panels:
-    """The settings of panels by their ids."""
-
     configs: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def add(self, kind: str, title: str = "", **config: Any) -> str:
-        """Add a panel and return its id."""
         name = f"{kind}!rsltrace{len(self.configs)}"
         if title:  # each program has a key of its own
             config |= {"foxglovePanelTitle": title, "lichtblickPanelTitle": title}

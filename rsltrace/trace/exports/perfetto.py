@@ -115,7 +115,6 @@ class _Packets:
         self._needs = messages.TracePacket.SEQ_NEEDS_INCREMENTAL_STATE
 
     def flush(self) -> None:
-        """Write what is waiting."""
         # One message after the other is one message with all their packets.
         self._file.write(self._batch.SerializeToString())
         self._batch = self._new()  # clearing a message does not give its memory back
@@ -169,7 +168,6 @@ class _Packets:
         one.debug_annotations.add(name_iid=1, uint_value=event)
 
     def count(self, track: int, stamp_ns: int, value: float) -> None:
-        """Add a value of a counter."""
         _, one = self._track_event(track, stamp_ns, self._event.TYPE_COUNTER)
         one.double_counter_value = value
 
@@ -240,8 +238,6 @@ def _chunks(trace: Trace) -> Iterator[_Chunk]:
 
 
 class _Export:
-    """Writes the tracks of one trace."""
-
     def __init__(self, trace: Trace, packets: _Packets) -> None:
         self._trace = trace
         self._packets = packets
@@ -258,7 +254,6 @@ class _Export:
         self._native = is_native(trace)
 
     def write(self, progress: Callable[[int, int], None]) -> None:
-        """Write all packets."""
         total, written = self._trace.event_count, 0
         timings = iterate_timings(self._trace)
         for chunk in _chunks(self._trace):

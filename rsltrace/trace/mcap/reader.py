@@ -240,7 +240,6 @@ def read_footer(source: ByteSource) -> McapFooter:
 
 
 def read_summary(source: ByteSource, footer: McapFooter) -> McapSummary:
-    """Return the summary. Raises DamageError."""
     length = footer.offset - footer.summary_start
     if length > SUMMARY_BYTES_MAX:
         raise DamageError(f"it has {length} bytes, more than {SUMMARY_BYTES_MAX}")

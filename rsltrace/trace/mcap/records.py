@@ -95,7 +95,6 @@ class RecordSpan(NamedTuple):
 
     @property
     def end(self) -> int:
-        """The offset behind it."""
         return self.offset + self.length
 
 
@@ -110,11 +109,9 @@ class RecordFields:
 
     @property
     def at_end(self) -> bool:
-        """Whether everything was read."""
         return self.position == len(self._data)
 
     def take(self, length: int) -> bytes:
-        """Return the next ``length`` bytes."""
         begin = self.position
         end = begin + length
         if end > len(self._data):
@@ -123,19 +120,15 @@ class RecordFields:
         return self._data[begin:end]
 
     def u16(self) -> int:
-        """Return the next unsigned 16-bit integer."""
         return self._integer(_U16)
 
     def u32(self) -> int:
-        """Return the next unsigned 32-bit integer."""
         return self._integer(_U32)
 
     def u64(self) -> int:
-        """Return the next unsigned 64-bit integer."""
         return self._integer(_U64)
 
     def text(self) -> str:
-        """Return the next string."""
         begin = self.position + 4
         end = begin + self._integer(_U32)
         if end > len(self._data):
@@ -147,7 +140,6 @@ class RecordFields:
             raise DamageError(f"a text is not UTF-8: {error}") from error
 
     def mapping(self) -> dict[str, str]:
-        """Return the next map of strings."""
         inner = RecordFields(self.take(self.u32()))
         result = {}
         while not inner.at_end:
@@ -229,20 +221,17 @@ def parse_header(body: bytes) -> McapHeader:
 
 
 def parse_schema(body: bytes) -> McapSchema:
-    """Parse a Schema record."""
     fields = RecordFields(body)
     return McapSchema(fields.u16(), fields.text(), fields.text(), fields.text())
 
 
 def parse_channel(body: bytes) -> McapChannel:
-    """Parse a Channel record."""
     fields = RecordFields(body)
     channel_id, schema_id = fields.u16(), fields.u16()
     return McapChannel(channel_id, schema_id, fields.text(), fields.text(), fields.mapping())
 
 
 def parse_statistics(body: bytes) -> McapStatistics:
-    """Parse a Statistics record."""
     fields = RecordFields(body)
     messages = fields.u64()
     fields.take(14)  # how many schemas, channels, attachments and metadata records there are
@@ -251,7 +240,6 @@ def parse_statistics(body: bytes) -> McapStatistics:
 
 
 def parse_chunk_index(body: bytes) -> ChunkIndexEntry:
-    """Parse a ChunkIndex record."""
     if len(body) < _CHUNK_INDEX_HEAD.size:
         raise DamageError("an entry of the list of chunks is cut off")
     start_ns, end_ns, offset, length, size = _CHUNK_INDEX_HEAD.unpack_from(body)

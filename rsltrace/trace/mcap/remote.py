@@ -65,7 +65,6 @@ class RemoteSource:
         return b"".join(pieces)[offset - begin : end - begin]
 
     def close(self) -> None:
-        """Drop the cache."""
         self._blocks.clear()
         self._whole = None
 

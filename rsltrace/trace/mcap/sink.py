@@ -88,7 +88,6 @@ class Sink:
 
     @property
     def closed(self) -> bool:
-        """Whether the file is closed."""
         return self._descriptor.number < 0
 
     @property

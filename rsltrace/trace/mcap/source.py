@@ -78,8 +78,6 @@ def range_problem(source: ByteSource, offset: int, length: int) -> str:
 
 
 class FileSource:
-    """A file on disk."""
-
     is_remote = False
 
     def __init__(self, path: Path, error: type[RsltraceError] = TraceError) -> None:
@@ -104,7 +102,6 @@ class FileSource:
         self.size = os.fstat(self._file.fileno()).st_size
 
     def read_at(self, offset: int, length: int) -> bytes:
-        """Return ``length`` bytes from ``offset``."""
         if problem := range_problem(self, offset, length):
             raise self._error(problem)
         try:

@@ -28,11 +28,9 @@ class HtmlSheet:
         self._paragraph("strong", title)
 
     def line(self, text: str) -> None:
-        """Add a line of text."""
         self._paragraph("span", text)
 
     def facts(self, rows: Iterable[tuple[str, object]]) -> None:
-        """Add names with their values."""
         self.table((), rows)
 
     def table(self, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -62,7 +60,6 @@ class HtmlSheet:
         SubElement(folded, "pre").text = "\n".join(kept)
 
     def html(self) -> str:
-        """Return the HTML."""
         return tostring(self._box, encoding="unicode", method="html")
 
     def _paragraph(self, kind: str, text: str) -> None:

@@ -81,7 +81,6 @@ class BagFiles:
     _stack: ExitStack = field(default_factory=ExitStack)
 
     def close(self) -> None:
-        """Close all files and remove decompressed copies."""
         self._stack.close()
 
 

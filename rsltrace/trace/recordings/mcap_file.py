@@ -340,7 +340,6 @@ class McapFile:
         yield from self._messages(self._parts[extent.offset], wanted, first_ns)
 
     def count(self, wanted: Mapping[int, int], first_ns: int) -> int:
-        """Return the number of wanted messages."""
         count = sum(self._index.counts[channel] for channel in wanted)
         for part in self._index.parts if first_ns > self.start_ns else []:
             if part.start_ns < first_ns:
@@ -349,7 +348,6 @@ class McapFile:
         return count
 
     def last_ns(self, wanted: Mapping[int, int], first_ns: int) -> int | None:
-        """Return the time of the last wanted message."""
         last_ns: int | None = None
         extents = self.extents(wanted, first_ns)
         for extent in sorted(extents, key=lambda extent: extent.end_ns, reverse=True):

@@ -37,7 +37,6 @@ class Playback:
 
     @property
     def start_ns(self) -> int:
-        """The time of the first message."""
         return self._first_ns if self.at_ns is None else self.at_ns
 
     @property

@@ -81,7 +81,6 @@ class SqliteFile:
             raise self._damaged(error) from None
 
     def count(self, wanted: Mapping[int, int], first_ns: int) -> int:
-        """Return the number of wanted messages."""
         if first_ns <= self.start_ns:
             return sum(topic.message_count for topic in self.topics if topic.id in wanted)
         ids = ", ".join(map(str, self._ids(wanted)))
@@ -91,7 +90,6 @@ class SqliteFile:
         return int(count)
 
     def last_ns(self, wanted: Mapping[int, int], first_ns: int) -> int | None:
-        """Return the time of the last wanted message."""
         ids = ", ".join(map(str, self._ids(wanted)))
         rows = self._rows(
             f"SELECT timestamp FROM messages WHERE timestamp >= ? AND topic_id IN ({ids}) "

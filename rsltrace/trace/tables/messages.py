@@ -161,7 +161,6 @@ class _Senders:
 
 
 def _channel(trace: TableInput, topic: str, type_name: str | None) -> ChannelInfo:
-    """Return the channel of a topic and type."""
     found = [channel for channel in trace.channels.values() if channel.topic == topic]
     if not found:
         topics = {channel.topic for channel in trace.channels.values()}
@@ -224,7 +223,6 @@ def _leaves(decoder: Decoder, prefix: str, interface: str) -> Iterator[_MessageC
 
 
 def _arrow_type(arrow: Any, decoder: Decoder, description: Any) -> Any:
-    """Return the type of a column."""
     kind, detail = description
     if kind == Nodetype.BASE:
         base = _BYTES.get(detail[0], detail[0])

@@ -103,8 +103,6 @@ _WHOLE_MAX = np.uint64(2**63 - 1)
 
 
 class TableInput(Protocol):
-    """What a table needs of a trace."""
-
     @property
     def name(self) -> str: ...
     @property
@@ -135,7 +133,6 @@ class TextDictionary:
         self.type = arrow.dictionary(arrow.int32(), arrow.string())
 
     def of(self, numbers: npt.NDArray[np.unsignedinteger]) -> Any:
-        """Return the texts of rows by their numbers."""
         places = self._places[np.minimum(numbers, len(self._places) - 1)]
         indices = self._arrow.array(places, mask=places < 0)
         return self._arrow.DictionaryArray.from_arrays(indices, self._texts)
@@ -148,8 +145,6 @@ def node_names(entities: Mapping[int, Entity]) -> dict[int, str | None]:
 
 
 def event_table(trace: TableInput, first: int, last: int | None) -> TraceTable:
-    """Return the events as a table."""
-
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
         whole, hashes, number = arrow.int64(), arrow.uint64(), arrow.uint32()
         entities = trace.entities
@@ -204,8 +199,6 @@ def event_table(trace: TableInput, first: int, last: int | None) -> TraceTable:
 
 
 def output_table(trace: TableInput, first: int, last: int | None) -> TraceTable:
-    """Return the outputs as a table."""
-
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
         whole, number = arrow.int64(), arrow.uint32()
         entities = trace.entities
@@ -252,8 +245,6 @@ def output_table(trace: TableInput, first: int, last: int | None) -> TraceTable:
 
 
 def entity_table(trace: TableInput) -> TraceTable:
-    """Return the entities as a table."""
-
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
         entities = list(trace.entities.values())
         nodes = node_names(trace.entities)

@@ -78,10 +78,8 @@ class EntityNames:
 
     @property
     def longest_node(self) -> int:
-        """The length of the longest node name."""
         return max(len(node) for node, _ in self._names.values())
 
     @property
     def longest_name(self) -> int:
-        """The length of the longest name."""
         return max(len(name) for _, name in self._names.values())

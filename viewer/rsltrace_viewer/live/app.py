@@ -88,14 +88,12 @@ class LiveApp(ViewerApp):
         self._breakpoints: Sequence[Breakpoint] = ()
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         for part in super().compose():
             if isinstance(part, Prompt):
                 yield BreakpointsPanel(id="breakpoints")
             yield part
 
     def on_mount(self) -> None:
-        """The source is always in sight."""
         self.screen_stack[0].add_class("with-source")
         super().on_mount()
 
@@ -108,7 +106,6 @@ class LiveApp(ViewerApp):
     # Executing.
 
     def first_shown(self) -> None:
-        """Say how one stops the run."""
         super().first_shown()
         self._show_breakpoints()
 
@@ -164,7 +161,7 @@ class LiveApp(ViewerApp):
             self._show_inspector(top=False)
 
     def _supersede(self) -> None:
-        if any(worker.group == "live" and worker.is_running for worker in self.workers):
+        if self.has_worker("live"):
             self.workers.cancel_group(self, "live")
             with suppress(DebugError):
                 self._execution.session.pause()
@@ -196,8 +193,11 @@ class LiveApp(ViewerApp):
 
     def action_escape(self) -> None:
         """Stop what runs; otherwise end the nearest thing that can be ended."""
-        running = any(w.group == "live" and w.is_running for w in self.workers)
-        if running and not self.prompt.asking and self._status.startswith("running"):
+        if (
+            self.has_worker("live")
+            and not self.prompt.asking
+            and self._status.startswith("running")
+        ):
             with suppress(DebugError):
                 self._execution.session.pause()
             return
@@ -206,7 +206,6 @@ class LiveApp(ViewerApp):
     # Breakpoints and questions.
 
     def action_ask(self, kind: str) -> None:
-        """Ask for what a live run is asked, too."""
         if kind not in _QUESTIONS:
             super().action_ask(kind)
             return
@@ -214,7 +213,6 @@ class LiveApp(ViewerApp):
         self.prompt.ask(Question(kind, label, hint, "", str))
 
     def on_prompt_answered(self, event: Prompt.Answered) -> None:
-        """Do what was asked for."""
         if event.kind not in _QUESTIONS:
             super().on_prompt_answered(event)
             return

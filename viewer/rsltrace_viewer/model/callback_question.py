@@ -29,7 +29,6 @@ class CallbackQuestion:
 
     @property
     def command(self) -> str:
-        """The command that asks it."""
         names = (shlex.quote(self.node), shlex.quote(self.what))
         at = ""
         if self.at_ns is not None:

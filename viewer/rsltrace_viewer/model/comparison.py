@@ -34,7 +34,6 @@ class Comparison:
 
     @property
     def count(self) -> int:
-        """How many places there are."""
         return self.rows.count
 
     @property
@@ -43,7 +42,6 @@ class Comparison:
         return self.rows.version
 
     def row(self, place: int) -> AlignedRow:
-        """Return a row."""
         return self.rows.row(place)
 
     def a(self, place: int) -> int | None:
@@ -71,7 +69,6 @@ class Comparison:
         return self.rows.place_of(index, of_b=other)
 
     def places_of(self, indexes: Ints, *, other: bool = False) -> Ints:
-        """Return the places of events."""
         return self.rows.places_of(indexes, of_b=other)
 
     def finish_diff(self) -> None:

@@ -61,7 +61,6 @@ class Bookmarks:
         self.events: set[Event] = set()
 
     def of(self, row: Iterable[Event]) -> bool:
-        """Return whether an event of a row is marked."""
         return bool(self.events) and not self.events.isdisjoint(row)
 
     def toggle(self, row: Iterable[Event]) -> bool:

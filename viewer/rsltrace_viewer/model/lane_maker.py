@@ -188,7 +188,6 @@ class LaneMaker:
         return np.flatnonzero(inside)
 
     def row_of(self, entity: int) -> int:
-        """Return the row of an entity's node."""
         return int(self._row_of_slot[self._slots[min(entity, len(self._slots) - 1)]])
 
     def _slots_of(self, segment: Segment) -> npt.NDArray[np.int64]:

@@ -30,7 +30,6 @@ class LogLine:
 
     @property
     def text(self) -> str:
-        """What it says, on one line."""
         return printable(shortened(self.record.text, _TEXT_MAX))
 
 

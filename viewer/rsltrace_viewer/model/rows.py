@@ -35,13 +35,10 @@ class RowList(Protocol):
 
 
 class AllRows:
-    """Every event is a row."""
-
     def __init__(self, count: int) -> None:
         self.count = count
 
     def at(self, row: int) -> int:
-        """Return ``row``."""
         return row
 
     def near(self, place: int) -> int:
@@ -66,7 +63,6 @@ class FilteredRows:
 
     @property
     def count(self) -> int:
-        """How many rows are known."""
         ends = self._up_to_date()
         return int(ends[-1]) if len(ends) else 0
 
@@ -87,7 +83,6 @@ class FilteredRows:
         min(left, key=lambda one: len(one.bits)).advance()
 
     def at(self, row: int) -> int:
-        """Return the place of a row."""
         ends = self._up_to_date()
         block = int(np.searchsorted(ends, row, side="right"))
         before = int(ends[block - 1]) if block else 0

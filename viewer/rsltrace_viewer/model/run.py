@@ -45,7 +45,6 @@ class Segment:
 
     @property
     def last(self) -> int:
-        """The index after the last event."""
         return self.first + len(self.events)
 
 
@@ -79,24 +78,20 @@ class Run:
         return printable(Path(self.trace.name).name)
 
     def close(self) -> None:
-        """Let go of the file."""
         self.trace.close()
 
     # Names.
 
     @cached_property
     def entities(self) -> Mapping[int, Entity]:
-        """All entities by id."""
         return self.trace.entities
 
     @cached_property
     def nodes(self) -> tuple[Entity, ...]:
-        """The nodes in the order they were created."""
         return tuple(e for e in self.entities.values() if e.kind is EntityKind.NODE)
 
     @cached_property
     def words(self) -> EventWords:
-        """The events in words."""
         return EventWords(self.trace)
 
     def node_name(self, entity_id: int) -> str:
@@ -109,7 +104,6 @@ class Run:
 
     @cached_property
     def topics(self) -> tuple[str, ...]:
-        """Names of all topics and services, sorted."""
         return tuple(sorted({e.name for e in self.entities.values() if e.kind in WITH_TOPIC}))
 
     @cached_property

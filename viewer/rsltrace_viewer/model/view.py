@@ -168,7 +168,6 @@ def fit(text: str, width: int, *, right: bool = False) -> str:
 
 
 def cells(text: str) -> int:
-    """Return how many cells ``text`` takes."""
     return len(text) if text.isascii() else cell_len(text)
 
 
@@ -200,9 +199,7 @@ class View(Protocol):
     """Places, numbered from 0. ``other`` means run b."""
 
     @property
-    def count(self) -> int:
-        """How many there are."""
-        ...
+    def count(self) -> int: ...
 
     @property
     def version(self) -> int:
@@ -252,11 +249,9 @@ class OneRun:
         self._aligned = aligned
 
     def a(self, place: int) -> int | None:
-        """Return ``place``, if this is run a."""
         return None if self._other else place
 
     def b(self, place: int) -> int | None:
-        """Return ``place``, if this is run b."""
         return place if self._other else None
 
     def sign(self, place: int) -> RowSign | None:
@@ -270,7 +265,6 @@ class OneRun:
         return other == self._other
 
     def before(self, place: int, *, other: bool = False) -> int:
-        """Return ``place``, for this run."""
         return place if other == self._other else 0
 
     def place_of(self, index: int, *, other: bool = False) -> int:
@@ -284,5 +278,4 @@ class OneRun:
         return min(self._aligned.before(row, of_b=self._other), max(self.count - 1, 0))
 
     def places_of(self, indexes: Ints, *, other: bool = False) -> Ints:
-        """Return ``indexes``."""
         return indexes

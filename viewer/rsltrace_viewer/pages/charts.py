@@ -29,8 +29,6 @@ Points = Sequence[tuple[float, float, bool]]
 
 
 class _Chart:
-    """A chart with two axes."""
-
     def __init__(self, x: tuple[float, float], y: tuple[float, float], says: str) -> None:
         self._x, self._y = _wide(x), _wide(y)
         box = f"0 0 {WIDTH} {HEIGHT}"
@@ -41,7 +39,6 @@ class _Chart:
         SubElement(self.element, "title").text = _short(says)
 
     def at(self, x: float, y: float) -> tuple[float, float]:
-        """Return where a point is drawn."""
         left, right = self._x
         low, high = self._y
         across = _share(x, left, right) * (WIDTH - _LEFT - _RIGHT)
@@ -63,7 +60,6 @@ class _Chart:
         self._text((wall + WIDTH) / 2, HEIGHT - 4, name, "middle")
 
     def bar(self, x: float, width: float, y: float, height: float, kind: str) -> None:
-        """Draw a bar."""
         left, top = self.at(x, y + height)
         right, floor = self.at(x + width, y)
         size = {"width": f"{max(right - left - 1, 0.5):.1f}", "height": f"{floor - top:.1f}"}
@@ -71,18 +67,15 @@ class _Chart:
         SubElement(self.element, "rect", place)
 
     def point(self, x: float, y: float, kind: str) -> None:
-        """Draw a point."""
         across, down = self.at(x, y)
         place = {"cx": f"{across:g}", "cy": f"{down:g}", "r": "2.5", "class": kind}
         SubElement(self.element, "circle", place)
 
     def path(self, points: Iterable[tuple[float, float]], kind: str) -> None:
-        """Draw a line through points."""
         drawn = " ".join("{:g},{:g}".format(*self.at(x, y)) for x, y in points)
         SubElement(self.element, "polyline", {"points": drawn, "class": kind})
 
     def upright(self, x: float) -> None:
-        """Draw a line from bottom to top."""
         across = self.at(x, self._y[0])[0]
         self._line(across, HEIGHT - _BOTTOM, across, _TOP)
 

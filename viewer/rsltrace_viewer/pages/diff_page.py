@@ -56,7 +56,7 @@ class Evidence:
     plots: Sequence[tuple[str, str, Markup]] = ()
 
 
-def diff_page(diffs: Sequence[Diff | BagDiff], options: DiffOptions, title: str = "") -> str:
+def diff_page(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return the page of one or several runs against one; of several, the first few that differ in
     full. The traces are opened again. Raises TraceError."""
     failed = [diff for diff in diffs if diff.failed]
@@ -68,7 +68,6 @@ def diff_page(diffs: Sequence[Diff | BagDiff], options: DiffOptions, title: str 
     shown = diffs if len(diffs) == 1 else failed[:_IN_FULL_MAX]
     return render_page(
         "diff.html",
-        title=title,
         heading=heading,
         good=not failed,
         several=[several_cells(diff) for diff in diffs] if len(diffs) > 1 else [],

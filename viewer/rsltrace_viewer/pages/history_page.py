@@ -15,7 +15,6 @@ from rsltrace_viewer.pages.page import render_page
 
 
 def history_page(found: HistorySummary) -> str:
-    """Return the page."""
     return render_page(
         "history.html",
         heading=summary_line(found),

@@ -28,7 +28,6 @@ _NODES = Markup("").join(
 
 
 def render_page(template: str, **values: object) -> str:
-    """Return a page, ending in a newline."""
     style, script = _own("style.css") + _NODES, _own("script.js")
     policy = (
         f"default-src 'none'; style-src {_digest(style)}; script-src {_digest(script)}; "

@@ -47,7 +47,6 @@ def search_page(
 
 
 def exploration_page(explored: Exploration) -> str:
-    """Return the page of an exploration."""
     runs = len(explored.results)
     rate = runs / explored.wall_s if explored.wall_s > 0 else 0.0
     numbers = (

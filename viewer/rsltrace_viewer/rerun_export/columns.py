@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -63,8 +63,10 @@ def lane(number: int) -> int:
     return _LANES[number % len(_LANES)]
 
 
-Column = tuple["ComponentDescriptor | str", pa.Array]
-"""A component (or the name of one of ours) with its values: one per row, or a list per row."""
+Component: TypeAlias = "ComponentDescriptor | pa.Field | str"
+"""Of Rerun's, as a loaded chunk has it, or one of ours by its name."""
+Column = tuple[Component, pa.Array]
+"""A component with its values: one per row, or a list per row."""
 
 Times = tuple[tuple[str, pa.Array], ...]
 
@@ -93,7 +95,6 @@ class Clock:
         return events if self.rows is None else self.rows.places_of(events, of_b=self.of_b)
 
     def times(self, stamps_ns: npt.NDArray[Any], events: npt.NDArray[np.int64]) -> Times:
-        """Return the columns of both timelines."""
         return (SIM_TIME, self.array(stamps_ns)), (self.order, pa.array(self.places(events)))
 
     @property
@@ -149,7 +150,9 @@ def lane_colours(path: str, colours: Mapping[str, int]) -> list[Chunk]:
     )
 
 
-def _field(component: ComponentDescriptor | str, values: pa.Array) -> pa.Field:
+def _field(component: Component, values: pa.Array) -> pa.Field:
+    if isinstance(component, pa.Field):
+        return component
     if isinstance(component, str):
         return pa.field(component, values.type)
     metadata = {
@@ -184,7 +187,6 @@ def vectors(values: npt.NDArray[np.floating[Any]]) -> pa.Array:
 
 
 def constant(value: Any, rows: int, kind: pa.DataType | None = None) -> pa.Array:
-    """Return ``value`` in every row."""
     return pa.repeat(pa.scalar(value, type=kind), rows)
 
 

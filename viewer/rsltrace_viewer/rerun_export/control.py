@@ -39,7 +39,6 @@ class Viewer:
         return self._process.poll()
 
     def open(self, recording: Path) -> None:
-        """Show a recording; it may go on loading."""
         found = self.client.open(str(recording.absolute()))
         self._recording = next(iter(found.store_ids), None)
 

@@ -131,7 +131,6 @@ def _say(**what: str) -> None:
 
 
 def main() -> None:
-    """Follow."""
     with suppress(Gone):
         try:
             follow(sys.argv[1:])

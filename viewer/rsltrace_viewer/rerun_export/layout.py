@@ -94,7 +94,6 @@ def _time_panel(
 
 
 def _order(shown: Sequence[Shown]) -> str:
-    """Return the timeline that counts events."""
     return EVENT if len(shown) == 1 else ROW
 
 

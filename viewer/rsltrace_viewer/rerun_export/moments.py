@@ -64,7 +64,6 @@ class Paths:
 
     @property
     def events(self) -> str:
-        """The table of events."""
         return join(self.root, "events")
 
     @property
@@ -83,7 +82,6 @@ class Paths:
         return printable(owner.name) if owner is not None and owner.name else NO_NODE
 
     def node(self, name: str) -> str:
-        """Return the path of a node."""
         return join(self.root, "nodes", name)
 
     def lane(self, name: str) -> str:

@@ -69,7 +69,6 @@ class LogRows:
             ) from error
 
     def _split(self, batch: pa.RecordBatch, moments: Moments) -> Iterator[Chunk]:
-        """Yield one chunk per node."""
         stamps = batch.column(_LOG_TIME).cast(pa.int64()).to_numpy()
         events, senders = moments.of_messages(TOPIC_ROSOUT, TOPIC_ROSOUT, stamps)
         self.count += len(stamps)

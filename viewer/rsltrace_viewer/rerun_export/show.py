@@ -50,7 +50,6 @@ def check_display(instead: str) -> None:
 
 
 def has_display(environ: Mapping[str, str], platform: str) -> bool:
-    """Return whether a window can be opened."""
     if platform in ("darwin", "win32"):
         return True
     return bool(environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY"))

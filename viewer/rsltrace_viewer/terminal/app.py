@@ -41,8 +41,6 @@ _ONLY = ("only-timeline", "only-inspector", "only-lanes", "only-source")
 
 
 class ViewerApp(Stepping):
-    """One session on the screen."""
-
     BINDINGS: ClassVar = [
         Binding(key.keys, key.action, key.help, show=False, priority=key.first) for key in KEYS
     ]
@@ -68,7 +66,6 @@ class ViewerApp(Stepping):
         self._follow_at_once = follow
 
     def on_mount(self) -> None:
-        """Show the overview first, if that was asked for."""
         if self._overview_first and not self.session.empty:
             self._push_overview(first=True)
 
@@ -83,7 +80,6 @@ class ViewerApp(Stepping):
             self.rested()
 
     def rested(self) -> None:
-        """Have Rerun follow."""
         here = self.session.current()
         if self._rerun is not None and here is not None:
             both = self.session.comparison
@@ -108,12 +104,10 @@ class ViewerApp(Stepping):
         return True
 
     def action_ask(self, kind: str) -> None:
-        """Ask for a search, a filter, a time or an index."""
         self._leave_overview()
         self.prompt.ask(question_of(kind, self.session))
 
     def on_prompt_answered(self, event: Prompt.Answered) -> None:
-        """Do what was asked for."""
         self.timeline.focus()
         if event.text is None:
             return
@@ -167,10 +161,10 @@ class ViewerApp(Stepping):
         screen = self.screen_stack[0]
         if self.prompt.asking:
             self.prompt.put_aside()
-        elif self._is_running("seek"):
+        elif self.has_worker("seek"):
             self.workers.cancel_group(self, "seek")
             self._say("stopped")
-        elif self._is_running("filter"):
+        elif self.has_worker("filter"):
             self._filter("")
         elif any(screen.has_class(name) for name in _ONLY):
             screen.remove_class(*_ONLY)
@@ -184,9 +178,6 @@ class ViewerApp(Stepping):
         elif self._follow is not None:
             self.action_follow()
 
-    def _is_running(self, group: str) -> bool:
-        return any(worker.group == group and worker.is_running for worker in self.workers)
-
     # Looking.
 
     def action_enter(self) -> None:
@@ -198,7 +189,6 @@ class ViewerApp(Stepping):
             self._choose_line(inspector.current.path, inspector)
 
     def on_inspector_chosen(self, event: Inspector.Chosen) -> None:
-        """A line was clicked."""
         self._choose_line(event.line.path, self.inspector)
 
     def _choose_line(self, path: str, inspector: Inspector) -> None:
@@ -212,12 +202,10 @@ class ViewerApp(Stepping):
             self._show_inspector(top=False)
 
     def on_timeline_picked(self, event: Timeline.Picked) -> None:
-        """A row was clicked."""
         self.timeline.focus()
         self.go(self.session.rows.at(event.row))
 
     def on_lanes_view_picked(self, event: LanesView.Picked) -> None:
-        """A column of the lanes was clicked."""
         session = self.session
         if session.empty:
             return
@@ -227,15 +215,12 @@ class ViewerApp(Stepping):
             self.go(session.place_after(event.position), centre=True)
 
     def on_lanes_view_zoomed(self, event: LanesView.Zoomed) -> None:
-        """The wheel was turned over the lanes."""
         self.action_zoom(event.step)
 
     def panes(self) -> list[Widget]:
-        """The parts of the screen that one can go to."""
         return [self.timeline, self.inspector, self.source, self.lanes]
 
     def action_pane(self, step: int) -> None:
-        """Go to the next part of the screen."""
         if self._leave_overview():
             return
         if len(self.screen_stack) > 1:
@@ -246,12 +231,10 @@ class ViewerApp(Stepping):
         shown[(place + step) % len(shown)].focus()
 
     def action_zoom(self, step: int) -> None:
-        """Zoom the lanes."""
         self.session.zoom(step, self.lanes.columns)
         self._show_lanes()
 
     def action_maximise(self) -> None:
-        """Give the whole screen to the current pane."""
         screen = self.screen_stack[0]
         if any(screen.has_class(name) for name in _ONLY):
             screen.remove_class(*_ONLY)
@@ -270,7 +253,6 @@ class ViewerApp(Stepping):
         self.call_after_refresh(self._redraw)
 
     def action_overview(self) -> None:
-        """Show the run at a glance."""
         self._push_overview(first=False)
         if not self.session.overviews:
             walk(self, "overview", self.session.survey(), self._looked)
@@ -305,7 +287,6 @@ class ViewerApp(Stepping):
         self.push_screen(OverviewScreen(self.session, first=first), chosen)
 
     def action_log(self) -> None:
-        """Show all log records."""
         from rsltrace_viewer.terminal.screens.logs import LogScreen
 
         def chosen(event: Event | None) -> None:
@@ -315,7 +296,6 @@ class ViewerApp(Stepping):
         self.push_screen(LogScreen(self.session), chosen)
 
     def action_source(self) -> None:
-        """Show the source of the callback, or hide it."""
         self.screen_stack[0].toggle_class("with-source")
         self.call_after_refresh(self._redraw)
         self._show_source()
@@ -367,16 +347,10 @@ class ViewerApp(Stepping):
         self.copy_to_clipboard(text)
         self._say(f"copied: {shortened(text, 40)}")
 
-    def action_theme(self) -> None:
-        """Change between dark and light."""
-        self.theme = "textual-dark" if self.theme == "textual-light" else "textual-light"
-
     def action_help(self) -> None:
-        """Show all keys."""
         self.push_screen(HelpScreen(two=self.session.b is not None, live=self.live))
 
     def action_plot(self) -> None:
-        """Open the plots."""
         from rsltrace_viewer.terminal.screens.plot import PlotScreen
 
         self.push_screen(PlotScreen(self.session.plots()))
@@ -407,7 +381,6 @@ class ViewerApp(Stepping):
         walk(self, "seek", question.answers(), arrive, at_once_s=0)
 
     def action_verdict(self) -> None:
-        """Show the whole report on two traces."""
         comparison = self.session.comparison
         if comparison is None:
             self._say("this is one trace; rsltrace view A B compares two")
@@ -419,7 +392,6 @@ class ViewerApp(Stepping):
             self.push_screen(ReportScreen(comparison.diff))
 
     def action_other(self) -> None:
-        """Show both runs, run a alone, run b alone in turn."""
         session = self.session
         side = session.next_side()
         if session.filter_text:
@@ -446,7 +418,6 @@ class ViewerApp(Stepping):
             self._say("following; Esc stops")
 
     def _grown(self, run: Run) -> None:
-        """Show a trace that got longer."""
         session = self.session
         at_end = session.empty or session.place >= session.view.count - 1
         session.replace_run(run)
@@ -474,11 +445,6 @@ class ViewerApp(Stepping):
             await self.run_action(action)
 
         return run
-
-    async def action_quit(self) -> None:
-        """Leave."""
-        self.workers.cancel_all()
-        self.exit()
 
 
 def open_session(a: Path, b: Path | None = None) -> Session:

@@ -22,6 +22,7 @@ from rsltrace_viewer.model.folder import Found
 from rsltrace_viewer.model.query.parser import completions
 from rsltrace_viewer.model.view import cells, fit
 from rsltrace_viewer.session import Session
+from rsltrace_viewer.terminal.widgets.list_view import Choices
 from rsltrace_viewer.terminal.widgets.prompt import Question
 
 # What the viewer asks for, and which answers are good: a search, a filter, a time, an index.
@@ -149,8 +150,6 @@ class ChooseApp(App[list[Path]]):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("q,escape", "quit", "quit"),
         Binding("space", "mark", "choose two to compare"),
-        Binding("j", "move(1)", show=False),
-        Binding("k", "move(-1)", show=False),
     ]
     CSS = """
     Static { padding: 0 1; background: $panel; }
@@ -164,17 +163,14 @@ class ChooseApp(App[list[Path]]):
         self.theme = "textual-light" if light else "textual-dark"
 
     def compose(self) -> ComposeResult:
-        """Make the list."""
         yield Static("Traces and recordings of this folder: which one?")
-        yield OptionList(*(Option(Content(self._text(i))) for i in range(len(self._found))))
+        yield Choices(*(Option(Content(self._text(i))) for i in range(len(self._found))))
         yield Static("Enter opens   Space marks one to compare with   q quits")
 
     def on_mount(self) -> None:
-        """Take the first."""
         self.query_one(OptionList).highlighted = 0
 
     def on_resize(self) -> None:
-        """Use the width there is."""
         self._show()
 
     def _text(self, place: int) -> str:
@@ -197,7 +193,6 @@ class ChooseApp(App[list[Path]]):
             options.replace_option_prompt_at_index(number, Content(self._text(number)))
 
     def action_mark(self) -> None:
-        """Mark or unmark."""
         place = self.query_one(OptionList).highlighted
         if place is None:
             return
@@ -206,11 +201,6 @@ class ChooseApp(App[list[Path]]):
         else:
             self._marked = [*self._marked[-1:], place]
         self._show()
-
-    def action_move(self, step: int) -> None:
-        """Move in the list."""
-        options = self.query_one(OptionList)
-        options.action_cursor_down() if step > 0 else options.action_cursor_up()
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         """Open what is marked; the one under the cursor, too."""

@@ -117,7 +117,6 @@ class RerunFollower:
                 os.write(self._process.stdin.fileno(), line.encode())
 
     def close(self) -> None:
-        """End the viewer and what drives it."""
         self._closing = True
         if self._process is None:
             return
@@ -161,7 +160,6 @@ class Follow:
         self._timer = app.set_interval(_EVERY_S, self._look)
 
     def stop(self) -> None:
-        """Stop looking."""
         self._timer.stop()
 
     def _look(self) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
     from rsltrace_viewer.terminal.app import ViewerApp
-    from rsltrace_viewer.terminal.recordings.app import RecordingApp
+    from rsltrace_viewer.terminal.recordings import RecordingApp
 
     Shown: TypeAlias = ViewerApp | RecordingApp
 

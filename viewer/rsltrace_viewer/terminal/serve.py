@@ -154,6 +154,5 @@ class _OneLine(logging.Handler):
     """Tells what went wrong with a viewer in one line."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """See the class."""
         if record.levelno >= logging.ERROR:
             tell(f"rsltrace view: {record.getMessage()}")

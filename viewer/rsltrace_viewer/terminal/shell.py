@@ -11,19 +11,18 @@ import asyncio
 from collections.abc import Callable
 from itertools import chain
 from time import perf_counter
-from typing import Any
 
 from textual import events
-from textual.app import App, ComposeResult
+from textual.app import ComposeResult
 from textual.containers import Container
 from textual.geometry import Size
 from textual.worker import get_current_worker
 
 from rsltrace.errors import RsltraceError
-from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.inspector.effects import Effects, effects_of
 from rsltrace_viewer.model.source import CallbackCode, source_of
 from rsltrace_viewer.session import Session
+from rsltrace_viewer.terminal.base import BaseApp
 from rsltrace_viewer.terminal.follow import walk
 from rsltrace_viewer.terminal.screens.overview import OverviewScreen
 from rsltrace_viewer.terminal.widgets.bars import FooterBar, HeaderBar, verdict_lines
@@ -43,10 +42,9 @@ _INSPECT_S = 0.02
 """Events are inspected when one has stopped at them for this long: holding a key stays smooth."""
 
 
-class Shell(App[None]):
+class Shell(BaseApp):
     """One session on the screen; what one can do with it is added by subclasses."""
 
-    TITLE = "rsltrace view"
     live = False
     """Whether events are executed."""
     CSS = """
@@ -80,10 +78,8 @@ class Shell(App[None]):
         light: bool = False,
     ) -> None:
         """Show ``session``, at place ``start`` (None: where it is)."""
-        super().__init__()
+        super().__init__(light=light)
         self.session = session
-        self.busy = True
-        """Whether something is about to be drawn that is not yet: for pictures and tests."""
         self._start = start
         self._share = 0
         """Of SHARES, how many the events have; 0: as the style sheet says."""
@@ -91,16 +87,10 @@ class Shell(App[None]):
         self._status = ""
         self._soon: asyncio.TimerHandle | None = None
         self.following = False
-        self.theme = "textual-light" if light else "textual-dark"
-
-    def notify(self, message: str, **more: Any) -> None:
-        """Show a message in a corner: what is in it may come from a file."""
-        super().notify(printable(message), markup=False, **more)
 
     # Setting up.
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         yield HeaderBar(id="header")
         yield LanesView(id="lanes")
         with Container(id="body"):
@@ -153,7 +143,6 @@ class Shell(App[None]):
 
     @property
     def overview(self) -> OverviewScreen | None:
-        """The overview, if one looks at it."""
         return next((one for one in self.screen_stack if isinstance(one, OverviewScreen)), None)
 
     def _explain(self) -> None:
@@ -186,31 +175,21 @@ class Shell(App[None]):
 
     @property
     def timeline(self) -> Timeline:
-        """The list of events."""
         return self.screen_stack[0].query_one(Timeline)
 
     @property
     def inspector(self) -> Inspector:
-        """The selected event."""
         return self.screen_stack[0].query_one(Inspector)
 
     @property
     def source(self) -> SourceView:
-        """The callback of the selected event."""
         return self.screen_stack[0].query_one(SourceView)
 
     @property
     def lanes(self) -> LanesView:
-        """The overview."""
         return self.screen_stack[0].query_one(LanesView)
 
-    @property
-    def prompt(self) -> Prompt:
-        """The question line."""
-        return self.screen_stack[0].query_one(Prompt)
-
     def _fit(self, width: int, height: int) -> None:
-        """Use the screen there is."""
         screen = self.screen_stack[0]
         screen.set_class(width >= WIDE, "wide")
         screen.set_class(height < 16, "low")
@@ -328,7 +307,6 @@ class Shell(App[None]):
         self._show_footer()
 
     def go(self, place: int, *, remember: bool = True, centre: bool = False) -> None:
-        """Select a place and show everything about it."""
         session = self.session
         if session.empty:
             return
@@ -374,17 +352,14 @@ class Shell(App[None]):
         self.call_after_refresh(self._redraw)
 
     def on_timeline_resized(self) -> None:
-        """Lay the columns out again."""
         self._show_rows()
         if not self.busy:
             self._show_values()
 
     def on_timeline_scrolled(self) -> None:
-        """Say what is in the rows that came into sight."""
         self._show_values()
 
     def on_lanes_view_resized(self) -> None:
-        """Count again."""
         self._show_lanes()
 
     def _redraw(self) -> None:

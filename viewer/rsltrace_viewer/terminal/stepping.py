@@ -15,8 +15,6 @@ from rsltrace_viewer.terminal.widgets.inspector import Inspector
 
 
 class Stepping(Shell):
-    """The keys that move."""
-
     def _focused_inspector(self) -> Inspector | None:
         inspector = self.inspector
         return inspector if self.focused is inspector else None
@@ -40,7 +38,6 @@ class Stepping(Shell):
         self.go(place, remember=False)
 
     def action_page(self, pages: int) -> None:
-        """Go on by a screen."""
         inspector = self._focused_inspector()
         if inspector is not None:
             inspector.move(pages * inspector.page)
@@ -111,7 +108,6 @@ class Stepping(Shell):
     # Cause and effect, history, marks.
 
     def action_cause(self) -> None:
-        """Go to the cause."""
         here = self.session.current()
         if here is None:
             return
@@ -123,7 +119,6 @@ class Stepping(Shell):
         self.go(self.session.view.place_of(cause, other=run is self.session.b))
 
     def action_effect(self) -> None:
-        """Go to the effect, or let choose between several."""
         here = self.session.current()
         if here is None:
             return
@@ -165,11 +160,9 @@ class Stepping(Shell):
         self._redraw()
 
     def action_go_back(self) -> None:
-        """Go back to where one was."""
         self._travel(self.session.travel(-1), "the start of your way")
 
     def action_go_forward(self) -> None:
-        """Go forward again."""
         self._travel(self.session.travel(1), "where you came from last")
 
     def _travel(self, place: int | None, what: str) -> None:
@@ -179,13 +172,11 @@ class Stepping(Shell):
             self.go(place, remember=False, centre=True)
 
     def action_mark(self) -> None:
-        """Mark the place, or remove its mark."""
         if not self.session.empty:
             self.session.toggle_mark()
             self.timeline.redraw()
 
     def action_next_mark(self, step: int) -> None:
-        """Go to the next mark."""
         place = self.session.next_mark(step)
         if place is None:
             self._say("no mark there; m sets one")

@@ -31,12 +31,9 @@ class Effects:
 
 @dataclass(frozen=True, slots=True)
 class CausedBy:
-    """The condition of being caused by an event."""
-
     event: int
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         found: Mask = segment.events["cause_event"] == np.uint64(self.event)
         return found
 

@@ -20,8 +20,6 @@ from rsltrace.trace.model.texts import PLACEHOLDERS, printable, shortened
 
 
 class Role(Enum):
-    """What a line is, for its colour."""
-
     SECTION = "section"
     FIELD = "field"
     BYTES = "bytes"
@@ -57,11 +55,9 @@ class Openness:
     toggled: set[str] = field(default_factory=set)
 
     def is_open(self, path: str, default: bool) -> bool:
-        """Whether ``path`` is open."""
         return default != (path in self.toggled)
 
     def toggle(self, path: str) -> None:
-        """Open or close ``path``."""
         self.toggled ^= {path}
 
 

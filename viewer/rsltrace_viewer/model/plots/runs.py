@@ -48,11 +48,9 @@ class RunPlots:
         self._chains = list(dict.fromkeys(chains))
 
     def title(self) -> str:
-        """Return the names of the runs."""
         return self._title
 
     def topics(self) -> list[str]:
-        """Return the topics with messages."""
         return list(dict.fromkeys(t for run in self._runs for t in topics_with_messages(run)))
 
     def others(self) -> list[PlotSource]:
@@ -102,11 +100,9 @@ class RunPlots:
         return (self._topic if wanted else ""), ""
 
     def cursor_s(self) -> float | None:
-        """Return the time of the selected event."""
         return None if self._stamp_ns is None else (self._stamp_ns - self._runs[0].base_ns) / 1e9
 
     def series(self, source: PlotSource) -> Iterator[list[Series]]:
-        """Yield the series of each run. Raises TraceError."""
         done: list[Series] = []
         for run in self._runs:
             latest = None

@@ -46,7 +46,6 @@ class PlotSource:
 
     @property
     def label(self) -> str:
-        """What it is called."""
         if self.kind == "field":
             return f"{self.name}  {self.field}"
         return f"{self.kind} of {self.name}"
@@ -394,21 +393,15 @@ def _draw(
 class PlotData(Protocol):
     """One or two things to plot. What decodes messages raises RsltraceError."""
 
-    def title(self) -> str:
-        """Return the names of what is plotted."""
-        ...
+    def title(self) -> str: ...
 
-    def topics(self) -> list[str]:
-        """Return the topics with messages."""
-        ...
+    def topics(self) -> list[str]: ...
 
     def others(self) -> list[PlotSource]:
         """Return what else can be plotted: rates, latencies."""
         ...
 
-    def fields(self, topic: str) -> list[PlotSource]:
-        """Return the numeric fields of a topic."""
-        ...
+    def fields(self, topic: str) -> list[PlotSource]: ...
 
     def messages(self, topic: str) -> list[list[object]]:
         """Return some messages of a topic in each run, as many in each. Raises TraceError."""
@@ -418,9 +411,7 @@ class PlotData(Protocol):
         """Return topic and field to begin with; either may be empty."""
         ...
 
-    def cursor_s(self) -> float | None:
-        """Return the time of what is selected."""
-        ...
+    def cursor_s(self) -> float | None: ...
 
     def series(self, source: PlotSource) -> Iterator[list[Series]]:
         """Yield the series of each run as they become known, the last time whole."""

@@ -59,7 +59,6 @@ class OfEntities(_Anywhere):
     outputs: bool = False
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         found: Mask = np.isin(segment.events["entity"], self.ids)
         if self.outputs:
             outputs = run.segment_outputs(segment.number)
@@ -69,34 +68,25 @@ class OfEntities(_Anywhere):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OfKinds(_Anywhere):
-    """Events of some kinds."""
-
     kinds: npt.NDArray[np.uint8]
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         found: Mask = np.isin(segment.events["kind"], self.kinds)
         return found
 
 
 @dataclass(frozen=True, slots=True)
 class WithFlag(_Anywhere):
-    """Events with a flag."""
-
     flag: EventFlag
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         found: Mask = (segment.events["flags"] & np.uint8(int(self.flag))) != 0
         return found
 
 
 @dataclass(frozen=True, slots=True)
 class Silent(_Anywhere):
-    """Events without outputs."""
-
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         found: Mask = segment.events["outputs"] == 0
         return found
 
@@ -110,7 +100,6 @@ class Between:
     high: int
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         values = segment.events[self.field]
         found: Mask = (values >= np.uint64(self.low)) & (values <= np.uint64(self.high))
         return found
@@ -133,7 +122,6 @@ class HashBegins(_Anywhere):
     digits: str
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         shift = np.uint64(64 - 4 * len(self.digits))
         wanted = np.uint64(int(self.digits, 16))
         events = segment.events
@@ -151,7 +139,6 @@ class WithOutput(_Anywhere):
     accept: Callable[[Run, Output], bool] | None = None
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         outputs = run.segment_outputs(segment.number)
         of_kind = outputs[np.isin(outputs["kind"], [int(kind) for kind in self.kinds])]
         found = np.zeros(len(segment.events), dtype=np.bool_)
@@ -195,7 +182,6 @@ class WithFinding:
     """Events in which the guard found something."""
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         found = np.fromiter(run.trace.findings, np.uint64, len(run.trace.findings))
         mask: Mask = np.isin(segment.events["index"], found)
         return mask
@@ -207,12 +193,9 @@ class WithFinding:
 
 @dataclass(frozen=True, slots=True)
 class Not:
-    """Events that do not fulfil ``inner``."""
-
     inner: EventFilter
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         return ~self.inner.mask(run, segment, among)
 
     def can_be_in(self, run: Run, number: int) -> bool:
@@ -227,7 +210,6 @@ class All:
     parts: tuple[EventFilter, ...]
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         left: Mask = among.copy()
         for part in self.parts:
             if not left.any():
@@ -236,25 +218,20 @@ class All:
         return left
 
     def can_be_in(self, run: Run, number: int) -> bool:
-        """Return whether all parts can be in it."""
         return all(part.can_be_in(run, number) for part in self.parts)
 
 
 @dataclass(frozen=True, slots=True)
 class Any:
-    """Events that fulfil one of ``parts``."""
-
     parts: tuple[EventFilter, ...]
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         found = np.zeros(len(segment.events), dtype=np.bool_)
         for part in self.parts:
             found |= part.mask(run, segment, among & ~found)
         return found
 
     def can_be_in(self, run: Run, number: int) -> bool:
-        """Return whether one part can be in it."""
         return any(part.can_be_in(run, number) for part in self.parts)
 
 

@@ -59,7 +59,6 @@ class MessageText:
         return True
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
         events = segment.events
         own = self._keys(run, segment.number)
         found: Mask = np.isin(events["index"], own // _POSITIONS)

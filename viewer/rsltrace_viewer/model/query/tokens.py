@@ -30,7 +30,6 @@ class Token:
 
     @property
     def end(self) -> int:
-        """The character after it."""
         return self.start + len(self.text)
 
 

@@ -58,7 +58,6 @@ class TopicMessages:
 
     @property
     def end(self) -> int:
-        """The number after the last."""
         return self.start + len(self.data)
 
     def all(self, value: bool) -> Mask:

@@ -23,25 +23,19 @@ _RATE_BINS = 240
 
 
 class RecordingPlots:
-    """What can be plotted of a session of recordings."""
-
     def __init__(self, session: RecordingSession) -> None:
         self._session = session
 
     def title(self) -> str:
-        """Return the names of the recordings."""
         return self._session.title()
 
     def topics(self) -> list[str]:
-        """Return the topics with messages."""
         return list(dict.fromkeys(name for name, _ in self._session.keys if self._of(name)))
 
     def others(self) -> list[PlotSource]:
-        """Return the rates."""
         return [PlotSource("rate", name) for name in self.topics()]
 
     def fields(self, topic: str) -> list[PlotSource]:
-        """Return the numeric fields of a topic's first message. Raises TraceError."""
         for recording, found in self._of(topic):
             if found.data and found.data[0] is not None:
                 message = recording.decode(found, found.data[0])
@@ -75,7 +69,6 @@ class RecordingPlots:
         return (session.keys[session.place][0] if session.keys else ""), ""
 
     def cursor_s(self) -> float | None:
-        """Return the time of the selected message."""
         session = self._session
         if not session.pairs.count:
             return None

@@ -149,14 +149,12 @@ class Pairs:
         return found
 
     def only(self, rows: npt.NDArray[np.bool_]) -> Pairs:
-        """Return these rows alone."""
         found = copy(self)
         found.a, found.b, found.differs = self.a[rows], self.b[rows], self.differs[rows]
         return found
 
     @property
     def count(self) -> int:
-        """How many rows there are."""
         return len(self.a)
 
     def at(self, row: int) -> tuple[int | None, int | None]:

@@ -98,7 +98,6 @@ class RecordingSession:
 
     @property
     def two(self) -> bool:
-        """Whether there are two."""
         return len(self.recordings) > 1
 
     def read(self) -> Iterator[int]:
@@ -119,7 +118,6 @@ class RecordingSession:
         return bool(self.damage) or all(recording.done for recording in self.recordings)
 
     def topics(self, key: Key) -> list[Topic | None]:
-        """Return a topic in each recording."""
         return [topics.get(key) for topics in self._by_key]
 
     @property
@@ -383,15 +381,12 @@ class RecordingSession:
     # Words about all of it.
 
     def title(self) -> str:
-        """Return the names of what is open."""
         return " ↔ ".join(recording.name for recording in self.recordings)
 
     def mode(self) -> str:
-        """Return what is shown."""
         return "two recordings" if self.two else "one recording"
 
     def facts(self) -> str:
-        """Return a line of facts."""
         counts = " and ".join(f"{recording.count:,}" for recording in self.recordings)
         parts = [f"{counts} messages", f"{len(self.keys)} topics"]
         if self.done:
@@ -416,7 +411,6 @@ class RecordingSession:
         return f"{'=' if same else '≠'} {self.diff.sentence}", not same
 
     def go_to_difference(self) -> None:
-        """Select the first message that differs."""
         if self.diff is None or self.diff.first is None:
             return
         first = self.diff.first

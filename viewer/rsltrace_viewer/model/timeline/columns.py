@@ -210,7 +210,6 @@ class ColumnLayout:
     """By node, its place in ``NODE_COLOURS``."""
 
     def header(self) -> str:
-        """Return the line of titles."""
         return " " * GAP + (" " * GAP).join(
             fit(self._title(column), width, right=column.right) for column, width in self.columns
         )

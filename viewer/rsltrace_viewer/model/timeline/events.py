@@ -30,8 +30,6 @@ _NODE_WIDTH_MAX = 28
 
 @dataclass(frozen=True, slots=True)
 class EventText:
-    """One event in words, each at its full length."""
-
     index: int
     time: str = ""
     node: str = ""

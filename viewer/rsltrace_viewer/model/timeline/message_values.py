@@ -172,14 +172,14 @@ def _joint_state(message: Any) -> str:
     values = next((v for v in (message.position, message.velocity, message.effort) if len(v)), ())
     texts = [number(float(value)) for value in values]
     if not len(message.name):
-        return f"{_some_of(texts, 'joints')}{' (no names)' if texts else ''}"
+        return f"{_joints(texts)}{' (no names)' if texts else ''}"
     names = [_cut(name) for name in message.name]
     named = [f"{name}={text}" for name, text in zip(names, texts, strict=False)]
-    return _some_of(named or names, "joints")
+    return _joints(named or names)
 
 
 def _trajectory(message: Any) -> str:
-    joints = _some_of([_cut(name) for name in message.joint_names], "joints")
+    joints = _joints([_cut(name) for name in message.joint_names])
     return f"{_count(message.points, 'point')} for {joints}"
 
 
@@ -213,9 +213,9 @@ def _first_of(text: Callable[[Any], str], items: Sequence[Any], what: str) -> st
     return f"{text(items[0])}{more}" if len(items) else f"no {what}"
 
 
-def _some_of(texts: list[str], what: str) -> str:
+def _joints(texts: list[str]) -> str:
     more = f" and {len(texts) - _VALUES_MAX} more" if len(texts) > _VALUES_MAX else ""
-    return " ".join(texts[:_VALUES_MAX]) + more or f"no {what}"
+    return " ".join(texts[:_VALUES_MAX]) + more or "no joints"
 
 
 def _count(items: Sized, what: str) -> str:

@@ -63,15 +63,12 @@ class Labels:
         self._of_single = np.full(count * _KINDS, -1, dtype=np.int64)
 
     def nodes(self, entities: npt.NDArray[Any]) -> pa.Array:
-        """Return the names of the nodes of entities."""
         return self._node_texts.take(self._numbers(entities))
 
     def callbacks(self, entities: npt.NDArray[Any]) -> pa.Array:
-        """Return the names of entities."""
         return self._callback_texts.take(self._numbers(entities))
 
     def kinds(self, kinds: npt.NDArray[Any]) -> pa.Array:
-        """Return the names of kinds of events."""
         return self._kind_texts.take(pa.array(kinds.astype(np.int32)))
 
     def sent(self, counts: npt.NDArray[Any], outputs: npt.NDArray[np.void]) -> pa.Array:
@@ -190,7 +187,6 @@ class Rates:
         self._last_event = np.zeros(self._steps, dtype=np.int64)
 
     def add(self, events: npt.NDArray[np.void]) -> None:
-        """Count events (EVENT_DTYPE)."""
         known = events[events["entity"] < self._entities]
         stamps = known["stamp"].astype(np.int64)
         steps = np.clip((stamps - self._start_ns) // self.step_ns, 0, self._steps - 1)
@@ -279,7 +275,6 @@ class EventRows:
                 )
 
     def _batches(self) -> Iterator[Batch]:
-        """Join segments until they are a batch."""
         events: list[npt.NDArray[np.void]] = []
         outputs: list[npt.NDArray[np.void]] = []
         for more_events, more_outputs in zip(

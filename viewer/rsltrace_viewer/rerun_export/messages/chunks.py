@@ -46,7 +46,6 @@ from rsltrace_viewer.rerun_export.messages.rows import (
     curves_of,
     is_command,
     left_out,
-    loaded_chunk,
     loaded_columns,
 )
 from rsltrace_viewer.rerun_export.messages.shapes import (
@@ -189,7 +188,7 @@ class MessageRows:
                 names = tuple(f"{self._paths.label} {n}".strip() for n in column[0].as_py())
                 self.seen.curves[path] = names
                 return self._curve_names(path, names, steps=is_command(topic))
-        return loaded_chunk(path, (), columns)
+        return make_chunk(path, (), columns)
 
     def _as_it_is(self, rows: ComponentRows) -> Iterator[Chunk]:
         """What the loader made, on our timelines, with the run's own frames."""
@@ -209,7 +208,7 @@ class MessageRows:
             self.seen.frames.drawn.add(rows.path)
         self.seen.topic_of.setdefault(rows.path, rows.topic)
         if columns:
-            yield from loaded_chunk(rows.path, rows.times, columns)
+            yield from make_chunk(rows.path, rows.times, columns)
         if _CLOUD in names:
             yield from self._cloud(rows, names)
 
@@ -245,7 +244,7 @@ class MessageRows:
                 yield from self._draw(rows, draw(messages, self._paint(rows.topic)), messages)
         translations = by_name.get("InstancePoses3D:translations")
         if translations is not None:
-            yield from self._curves(rows, _vector_curves("position", "xyz", translations))
+            yield from self._curves(rows, _vector_curves("xyz", translations))
             yield from self._loaded_pose(rows, by_name)
         fixes = by_name.get("GeoPoints:positions")
         if fixes is not None:
@@ -329,7 +328,7 @@ class MessageRows:
         self.seen.fixes[rows.path] = None
         positions = _flat(fixes, 2)
         self._trails.add_fixes(rows.path, self._paint(rows.topic), positions)
-        yield from self._curves(rows, _vector_curves("position", ("latitude", "longitude"), fixes))
+        yield from self._curves(rows, _vector_curves(("latitude", "longitude"), fixes))
         if altitude is not None:
             counts = np.ones(len(altitude), dtype=np.int64)
             scalars = lists(counts, pa.array(numbers(altitude.flatten())))
@@ -388,8 +387,8 @@ def _flat(column: pa.Array, size: int) -> npt.NDArray[np.float64]:
     return np.asarray(values, dtype=np.float64).reshape(-1, size)
 
 
-def _vector_curves(path: str, names: str | tuple[str, ...], column: pa.Array) -> Iterator[Curves]:
+def _vector_curves(names: str | tuple[str, ...], column: pa.Array) -> Iterator[Curves]:
     values = _flat(column, len(names))
     if len(values) == len(column):
         counts = np.full(len(values), len(names), dtype=np.int64)
-        yield Curves(path, tuple(names), lists(counts, pa.array(values.reshape(-1))))
+        yield Curves("position", tuple(names), lists(counts, pa.array(values.reshape(-1))))

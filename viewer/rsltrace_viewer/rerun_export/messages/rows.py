@@ -6,14 +6,13 @@ Rows of one kind wait here until there are enough for a chunk: faster to write, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from rerun.chunk import Chunk
 from rosbags.interfaces import Nodetype
 
 from rsltrace.errors import TraceError
@@ -251,7 +250,6 @@ class Waiting:
         return self.rows >= _ROWS_PER_CHUNK or self.bytes >= _BYTES_PER_CHUNK
 
     def joined(self, clock: Clock) -> ComponentRows:
-        """Return all rows."""
         if len(self.parts) == 1:
             arrays = self.parts[0]
         else:
@@ -270,17 +268,3 @@ def loaded_columns(batch: pa.RecordBatch) -> LoadedColumns:
         for place, f in enumerate(batch.schema)
         if (f.metadata or {}).get(b"rerun:kind") == b"data"
     )
-
-
-def loaded_chunk(
-    path: str, times: Times, columns: Sequence[tuple[pa.Field, pa.Array]]
-) -> list[Chunk]:
-    """Return loaded columns as the chunk (a list of one) of another entity, at our times."""
-    fields = [pa.field(name, values.type) for name, values in times]
-    fields += [f for f, _ in columns]
-    batch = pa.RecordBatch.from_arrays(
-        [values for _, values in (*times, *columns)], schema=pa.schema(fields)
-    )
-    index = [name for name, _ in times] or None
-    chunks: list[Chunk] = Chunk.from_record_batch(batch, index=index, entity_path=path)
-    return chunks

@@ -115,7 +115,6 @@ class Paint:
         return Paint(channels[0] << 24 | channels[1] << 16 | channels[2] << 8 | 255)
 
     def column(self, rows: int) -> pa.Array:
-        """Return it for every row."""
         return constant(self.rgba, rows, pa.uint32())
 
 
@@ -245,10 +244,10 @@ SHAPES: Mapping[str, Callable[[pa.StructArray, Paint], Drawing]] = {
 """By type: what draws it. Markers, which are many things in one message, are in ``markers``."""
 
 
-def frames_of(messages: pa.StructArray, field: str = "header.frame_id") -> list[Any]:
+def frames_of(messages: pa.StructArray) -> list[Any]:
     """Return the frame of each message, or an empty list if the type has none."""
     try:
-        return list(get(messages, field).to_pylist())
+        return list(get(messages, "header.frame_id").to_pylist())
     except KeyError:
         return []
 

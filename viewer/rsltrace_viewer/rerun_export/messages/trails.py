@@ -39,7 +39,6 @@ class Track:
         self._added = 0
 
     def add(self, positions: npt.NDArray[np.float64]) -> None:
-        """Add positions, shape (n, k)."""
         kept = positions[self._next - self._added :: self._stride]
         self._added += len(positions)
         self._next += len(kept) * self._stride
@@ -104,7 +103,6 @@ class Trails:
                 yield path, frame, points, make_chunk(path, (), columns)
 
     def fixes(self) -> Iterator[Chunk]:
-        """Yield the tracks on the map."""
         for topic_path, (track, paint) in self._fixes.items():
             points = track.points
             if len(points):

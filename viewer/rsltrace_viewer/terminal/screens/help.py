@@ -41,14 +41,12 @@ class HelpScreen(ModalScreen[None]):
         self._live = live
 
     def compose(self) -> ComposeResult:
-        """Make the text."""
         with VerticalScroll() as box:
             box.border_title = "rsltrace view: keys"
             box.border_subtitle = "Esc closes, ↓ scrolls"
             yield Static(self.text())
 
     def text(self) -> Content:
-        """Return the text."""
         return help_text(self.app.size.width, two=self._two, live=self._live)
 
 
@@ -61,20 +59,15 @@ class KeysScreen(HelpScreen):
         self._fields = fields
 
     def text(self) -> Content:
-        """Return the text."""
-        groups = dict.fromkeys(key.group for key in self._keys)
-        blocks = [_keys_block(group, self._keys) for group in groups]
-        blocks.append(_filter_block(self._fields, _EXAMPLE_OF_MESSAGES))
-        return _in_columns(blocks, self.app.size.width)
+        found = _filter_block(self._fields, _EXAMPLE_OF_MESSAGES)
+        return _in_columns([*_keys_blocks(self._keys), found], self.app.size.width)
 
 
 def help_text(width: int, *, two: bool, live: bool = False) -> Content:
     """Return the help for a screen of ``width`` cells, in columns where there is room."""
-    keys = keys_of(two=two, live=live)
-    blocks = [_keys_block(group, keys) for group in dict.fromkeys(key.group for key in keys)]
-    blocks.append(_signs_block(two))
+    blocks = [*_keys_blocks(keys_of(two=two, live=live)), _signs_block(two), _lanes_block()]
     fields = {name: field.help for name, field in FIELDS.items()}
-    return _in_columns([*blocks, _lanes_block(), _filter_block(fields, _EXAMPLE)], width)
+    return _in_columns([*blocks, _filter_block(fields, _EXAMPLE)], width)
 
 
 def _in_columns(blocks: Sequence[Sequence[Content]], width: int) -> Content:
@@ -95,16 +88,20 @@ def _in_columns(blocks: Sequence[Sequence[Content]], width: int) -> Content:
     return Content("\n").join(lines)
 
 
+def _keys_blocks(keys: Sequence[Key]) -> list[list[Content]]:
+    return [_keys_block(group, keys) for group in dict.fromkeys(key.group for key in keys)]
+
+
 def _keys_block(group: str, keys: Sequence[Key]) -> list[Content]:
     lines = [Content.styled(group, "bold underline")]
-    for key in keys:
-        if key.group == group:
-            shown = fit(key.shown, _KEY_WIDTH)
-            lines.append(Content.assemble("  ", (shown, "bold $text-primary"), key.help))
+    lines += [_entry(key.shown, key.help) for key in keys if key.group == group]
     if group == "Look" and any(key.action == "follow" for key in keys):
-        shown = fit("Ctrl+P", _KEY_WIDTH)
-        lines.append(Content.assemble("  ", (shown, "bold $text-primary"), "command palette"))
+        lines.append(_entry("Ctrl+P", "command palette"))
     return lines
+
+
+def _entry(shown: str, text: str) -> Content:
+    return Content.assemble("  ", (fit(shown, _KEY_WIDTH), "bold $text-primary"), text)
 
 
 def _signs_block(two: bool) -> list[Content]:
@@ -125,10 +122,8 @@ def _signs_block(two: bool) -> list[Content]:
             ("~", "the same, at another time or place"),
             ("?", "not compared"),
         ]
-    lines = [Content.styled("Signs at the left of an event", "bold underline")]
-    for sign, text in signs:
-        lines.append(Content.assemble("  ", (fit(sign, _KEY_WIDTH), "bold $text-primary"), text))
-    return lines
+    head = Content.styled("Signs at the left of an event", "bold underline")
+    return [head, *(_entry(sign, text) for sign, text in signs)]
 
 
 def _lanes_block() -> list[Content]:
@@ -146,9 +141,7 @@ _EXAMPLE_OF_MESSAGES = "topic:/scan time:>2 (text:nan or index:<5)"
 
 def _filter_block(fields: Mapping[str, str], example: str) -> list[Content]:
     lines = [Content.styled("Filters (F) and searches (/)", "bold underline")]
-    for name, text in fields.items():
-        shown = fit(f"{name}:", _KEY_WIDTH)
-        lines.append(Content.assemble("  ", (shown, "bold $text-primary"), text))
+    lines += [_entry(f"{name}:", text) for name, text in fields.items()]
     lines += [
         Content("  a bare word looks in names, logs and exceptions"),
         Content("  all must hold; or  not  ( )  and - before a field"),

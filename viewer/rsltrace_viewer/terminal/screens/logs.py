@@ -43,7 +43,6 @@ class LogScreen(Screen[Event | None]):
         self._known = -1
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         yield Static(id="what")
         yield ListView(id="lines")
         yield Static("↑↓ choose   Enter goes to the event   w level   y copies   Esc closes")
@@ -99,20 +98,17 @@ class LogScreen(Screen[Event | None]):
         )
 
     def action_level(self) -> None:
-        """Show all, warnings, errors in turn."""
         self._level = (self._level + 1) % len(_LEVELS)
         self._known = -1
         self._show_more(first=True)
 
     def action_yank(self) -> None:
-        """Copy the record under the cursor."""
         if self._lines:
             text = "".join(piece for piece, _ in self._row(self.query_one(ListView).cursor))
             self.app.copy_to_clipboard(text.strip())
             self.app.notify(f"copied: {text.strip()}")
 
     def on_list_view_chosen(self, event: ListView.Chosen) -> None:
-        """Go to the event that logged it."""
         name, line = self._lines[event.line]
         session = self._session
         run = session.b if name == RUN_B and session.b is not None else session.a

@@ -82,18 +82,15 @@ class OverviewScreen(Screen[Choice | None]):
         """By the choice of its line, the node and the name of a callback."""
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         yield HeaderBar(id="what")
         yield ListView(id="lines")
         yield Static(_FIRST if self._first else _LATER, id="keys")
 
     def on_mount(self) -> None:
-        """Show what is known."""
         self.query_one(ListView).focus()
         self.update_lines()
 
     def on_resize(self) -> None:
-        """Use the width there is."""
         self.update_lines()
 
     def on_key(self, event: events.Key) -> None:
@@ -115,13 +112,11 @@ class OverviewScreen(Screen[Choice | None]):
             self.dismiss(None)
 
     def action_yank(self) -> None:
-        """Copy the line under the cursor."""
         text = "".join(piece for piece, _ in self._lines[self.query_one(ListView).cursor][0])
         self.app.copy_to_clipboard(text.strip())
         self.app.notify(f"copied: {text.strip()}")
 
     def update_lines(self) -> None:
-        """Show what is known by now."""
         if not self.query(ListView):  # it is about to be there, or was closed
             return
         session = self._session

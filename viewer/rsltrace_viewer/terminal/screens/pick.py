@@ -13,14 +13,14 @@ from textual.screen import ModalScreen
 from textual.widgets import OptionList
 from textual.widgets.option_list import Option
 
+from rsltrace_viewer.terminal.widgets.list_view import Choices
+
 
 class PickScreen(ModalScreen[int | None]):
     """Gives the number of the choice, or None."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         ("escape,q", "dismiss(None)", "close"),
-        ("j", "down", ""),
-        ("k", "up", ""),
     ]
     DEFAULT_CSS = """
     PickScreen { align: center middle; }
@@ -36,20 +36,10 @@ class PickScreen(ModalScreen[int | None]):
         self._choices = choices
 
     def compose(self) -> ComposeResult:
-        """Make the list."""
         with Vertical() as box:
             box.border_title = Content(self._title)
             box.border_subtitle = "Enter chooses, Esc closes"
-            yield OptionList(*(Option(Content(choice)) for choice in self._choices))
-
-    def action_down(self) -> None:
-        """Move down."""
-        self.query_one(OptionList).action_cursor_down()
-
-    def action_up(self) -> None:
-        """Move up."""
-        self.query_one(OptionList).action_cursor_up()
+            yield Choices(*(Option(Content(choice)) for choice in self._choices))
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Choose."""
         self.dismiss(event.option_index)

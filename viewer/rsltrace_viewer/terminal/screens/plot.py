@@ -29,13 +29,12 @@ from rsltrace_viewer.model.plots.series import (
 )
 from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.terminal.follow import walk
+from rsltrace_viewer.terminal.widgets.list_view import Choices
 
 _AXIS = 11
 
 
 class PlotView(Widget):
-    """Draws series in braille with axes."""
-
     COMPONENT_CLASSES: ClassVar[set[str]] = {"plot--axis", "plot--a", "plot--b", "plot--both"}
     DEFAULT_CSS = """
     PlotView { width: 1fr; height: 1fr; background: $background; }
@@ -53,7 +52,6 @@ class PlotView(Widget):
         self._plot: tuple[tuple[int, int], Plot] | None = None
 
     def show(self, title: str, series: list[Series], cursor_s: float | None) -> None:
-        """Show one or two series."""
         self._title, self._series, self._cursor_s = title, series, cursor_s
         self._plot = None
         self.refresh()
@@ -96,8 +94,6 @@ class PlotScreen(Screen[None]):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,backspace", "back", "back"),
         Binding("q,p", "dismiss", "close"),
-        Binding("j", "move(1)", show=False),
-        Binding("k", "move(-1)", show=False),
     ]
     DEFAULT_CSS = """
     PlotScreen Static { background: $panel; padding: 0 1; height: 1; }
@@ -117,10 +113,9 @@ class PlotScreen(Screen[None]):
         self._topic = ""
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         yield Static(id="what")
         with Horizontal():
-            yield OptionList()
+            yield Choices()
             with Vertical():
                 yield PlotView(id="plot")
                 yield PlotView(id="difference")
@@ -186,7 +181,6 @@ class PlotScreen(Screen[None]):
             self._show(f"{printable(choice)} has no numbers", [])
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Show the fields of a topic."""
         choice = self._choices[event.option_index]
         if isinstance(choice, str):
             self._fields_level(choice)
@@ -219,11 +213,6 @@ class PlotScreen(Screen[None]):
             self._top_level(self._topic)
         else:
             self.dismiss()
-
-    def action_move(self, step: int) -> None:
-        """Move in the list."""
-        options = self.query_one(OptionList)
-        options.action_cursor_down() if step > 0 else options.action_cursor_up()
 
 
 def _words(choice: PlotSource | str) -> str:

@@ -24,14 +24,11 @@ _STYLES = {
 
 
 class ReportScreen(TextScreen):
-    """The report on two runs or recordings."""
-
     def __init__(self, diff: Diff | BagDiff) -> None:
         super().__init__("why the runs diverge")
         self._diff = diff
 
     def text(self) -> Content:
-        """Return the report."""
         lines = report_lines(_without_view(self._diff), DiffOptions(), width=self.room)
         return Content("\n").join(
             Content.assemble(*((piece, _STYLES.get(style, "")) for piece, style in line))

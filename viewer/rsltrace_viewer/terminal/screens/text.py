@@ -34,7 +34,6 @@ class TextScreen(ModalScreen[int | None]):
         self._title, self._text, self._event = title, text, event
 
     def compose(self) -> ComposeResult:
-        """Make the text."""
         with VerticalScroll() as box:
             box.border_title = Content(self._title)
             goes = "" if self._event is None else f"Enter goes to event {self._event}, "
@@ -42,14 +41,11 @@ class TextScreen(ModalScreen[int | None]):
             yield Static(self.text())
 
     def text(self) -> Content:
-        """Return the text."""
         return self._text or Content()
 
     @property
     def room(self) -> int:
-        """Cells of a line."""
         return max(min(self.app.size.width, _WIDTH_MAX) - 6, 40)
 
     def action_go(self) -> None:
-        """Go to the event."""
         self.dismiss(self._event)

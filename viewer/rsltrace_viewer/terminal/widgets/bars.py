@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from rich.segment import Segment as Piece
 from rich.style import Style
 from textual import events
 from textual.content import Content
 from textual.geometry import Size
 from textual.scroll_view import ScrollView
+from textual.strip import Strip
 from textual.widget import Widget
 from textual.widgets import Static
 
@@ -18,9 +22,24 @@ from rsltrace_viewer.terminal.keys import footer_keys
 # What widgets that draw their own lines need of Textual beyond its usual ways.
 
 
-def background_of(style: Style) -> Style:
-    """Return what of ``style`` lies over others: its background and weight, not its colour."""
-    return Style(bgcolor=style.bgcolor, bold=style.bold)
+def line_of(
+    pieces: Sequence[Piece],
+    width: int,
+    plain: Style,
+    *,
+    more: Style | None = None,
+    over: Style | None = None,
+) -> Strip:
+    """Return a line of ``width`` cells that goes on in ``plain``, or is cut, with an ellipsis in
+    style ``more``. Background and weight of ``over`` lie over it."""
+    strip = Strip(pieces)
+    if more is not None and strip.cell_length > width:
+        strip = Strip([*strip.crop(0, width - 1), Piece("…", more)])
+    strip = strip.adjust_cell_length(width, plain)
+    if over is None:
+        return strip
+    style = Style(bgcolor=over.bgcolor, bold=over.bold)
+    return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
 
 
 def node_style(widget: Widget, colour: int) -> Style:
@@ -87,7 +106,6 @@ class FooterBar(Static):
         self._places: list[tuple[int, str]] = []
 
     def show(self, *, two: bool, searching: str, status: str, live: bool = False) -> None:
-        """Show the keys, and a status at the right."""
         status = printable(status)
         width = self.size.width - 2
         room = width - (cells(status) + 2 if status else 0)
@@ -106,7 +124,6 @@ class FooterBar(Static):
         self.update(Content.assemble(*parts), layout=False)
 
     async def on_click(self, event: events.Click) -> None:
-        """Do what the key does that was clicked."""
         for end, action in self._places:
             if event.x - 1 < end:
                 await self.app.run_action(f"app.{action}")

@@ -14,7 +14,7 @@ from textual.strip import Strip
 
 from rsltrace_viewer.model.inspector.message_tree import Line, Role
 from rsltrace_viewer.model.view import cells, fit, wrap
-from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
+from rsltrace_viewer.terminal.widgets.bars import line_of, set_virtual_size
 
 _IN_FULL = (Role.NOTE, Role.ERROR, Role.WARNING, Role.DIFFERENCE)
 _VALUE_LINES = 4
@@ -22,8 +22,6 @@ _LABEL_MAX = 24
 
 
 class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
-    """Draws lines and has a cursor of its own."""
-
     COMPONENT_CLASSES: ClassVar[set[str]] = {f"inspector--{role.value}" for role in Role} | {
         "inspector--label",
         "inspector--cursor",
@@ -57,21 +55,17 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
         self.cursor = 0
         self._lines: list[Line] = []
         self._drawn: list[tuple[Line, str]] = []
-        self._styles: dict[str, Style] = {}
 
     @property
     def lines(self) -> list[Line]:
-        """The lines shown."""
         return self._lines
 
     @property
     def page(self) -> int:
-        """How many lines are in sight."""
         return max(self.scrollable_content_region.height, 1)
 
     @property
     def current(self) -> Line | None:
-        """The line under the cursor."""
         return self._drawn[self.cursor][0] if self.cursor < len(self._drawn) else None
 
     def show(self, lines: list[Line], *, top: bool = True) -> None:
@@ -90,7 +84,6 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
             self._refresh_changes(before, first)
 
     def move(self, step: int) -> None:
-        """Move the cursor by lines."""
         self.cursor = max(min(self.cursor + step, len(self._drawn) - 1), 0)
         height = self.page
         if self.cursor < self.scroll_y:
@@ -99,26 +92,11 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
             self.scroll_to(y=self.cursor - height + 1, animate=False, force=True, immediate=True)
         self.refresh()
 
-    def notify_style_update(self) -> None:
-        """Forget the styles of the old theme."""
-        self._styles.clear()
-        super().notify_style_update()
-
     def on_resize(self, event: events.Resize) -> None:
-        """Wrap long values again."""
         self._lay_out()
         self.refresh()
 
-    def on_focus(self) -> None:
-        """Show the cursor."""
-        self.refresh()
-
-    def on_blur(self) -> None:
-        """Hide the cursor."""
-        self.refresh()
-
     def on_click(self, event: events.Click) -> None:
-        """Open, close or follow what was clicked."""
         place = event.get_content_offset(self)
         row = round(self.scroll_y) + (place.y if place is not None else len(self._drawn))
         if row < len(self._drawn):
@@ -144,16 +122,9 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
         set_virtual_size(self, Size(width, len(drawn)))
 
     def _style(self, name: str) -> Style:
-        style = self._styles.get(name)
-        if style is None:
-            style = self.get_component_rich_style(f"inspector--{name}")
-            if name == "cursor":
-                style = background_of(style)
-            self._styles[name] = style
-        return style
+        return self.get_component_rich_style(f"inspector--{name}")
 
     def render_line(self, y: int) -> Strip:
-        """Return line ``y`` of the widget."""
         row = round(self.scroll_y) + y
         width = self.scrollable_content_region.width
         if row >= len(self._drawn):
@@ -178,14 +149,8 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
                 Piece(f"{label or gap} " if label or gap else "", self._style("label")),
                 Piece(text, self._style(line.role.value)),
             ]
-        strip = Strip(pieces)
-        if strip.cell_length > width:
-            strip = Strip([*strip.crop(0, width - 1), Piece("…", self._style("label"))])
-        strip = strip.adjust_cell_length(width, self._style("field"))
-        if self.has_focus and row == self.cursor:
-            style = self._style("cursor")
-            return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
-        return strip
+        over = self._style("cursor") if self.has_focus and row == self.cursor else None
+        return line_of(pieces, width, self._style("field"), more=self._style("label"), over=over)
 
     def _refresh_changes(self, before: list[tuple[Line, str]], cursor: int) -> None:
         """Draw what changed: over a slow line every row counts."""

@@ -90,11 +90,9 @@ class LanesView(Widget, can_focus=True):
         self._label_width = 8
         self._names = ShortNames(())
         self._colours: Mapping[str, int] = {}
-        self._styles: dict[str, Style] = {}
 
     @property
     def columns(self) -> int:
-        """How many columns there are for events."""
         return max(self.size.width - self._before_lanes - 1, 1)
 
     @property
@@ -145,13 +143,7 @@ class LanesView(Widget, can_focus=True):
         else:
             self.refresh()
 
-    def notify_style_update(self) -> None:
-        """Forget the styles of the old theme."""
-        self._styles.clear()
-        super().notify_style_update()
-
     def on_resize(self, event: events.Resize) -> None:
-        """Count the columns again."""
         self.post_message(self.Resized())
 
     def on_mouse_down(self, event: events.MouseDown) -> None:
@@ -171,22 +163,12 @@ class LanesView(Widget, can_focus=True):
             self.release_mouse()
 
     def on_mouse_scroll_up(self, event: events.MouseScrollUp) -> None:
-        """Zoom in."""
         event.stop()
         self.post_message(self.Zoomed(1))
 
     def on_mouse_scroll_down(self, event: events.MouseScrollDown) -> None:
-        """Zoom out."""
         event.stop()
         self.post_message(self.Zoomed(-1))
-
-    def on_focus(self) -> None:
-        """Mark the line of times."""
-        self.refresh()
-
-    def on_blur(self) -> None:
-        """Mark the line of times no more."""
-        self.refresh()
 
     def _pick(self, x: int) -> None:
         column = x - self._before_lanes
@@ -211,10 +193,7 @@ class LanesView(Widget, can_focus=True):
             column += step
 
     def _style(self, name: str) -> Style:
-        style = self._styles.get(name)
-        if style is None:
-            style = self._styles[name] = self.get_component_rich_style(f"lanes--{name}")
-        return style
+        return self.get_component_rich_style(f"lanes--{name}")
 
     def _first_lane(self) -> int:
         """Which lane is on top: the selected one stays in sight when there are too many."""
@@ -227,7 +206,6 @@ class LanesView(Widget, can_focus=True):
         return max(0, min(names.index(self._own) - room // 2, len(names) - room))
 
     def render_line(self, y: int) -> Strip:
-        """Return a lane, or the axis at the bottom."""
         width = self.size.width
         if self.lanes is None:
             return Strip([Piece(" " * width, self._style("empty"))], width)

@@ -8,12 +8,14 @@ from typing import ClassVar
 from rich.segment import Segment as Piece
 from rich.style import Style
 from textual import events
+from textual.binding import Binding, BindingType
 from textual.geometry import Size
 from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
+from textual.widgets import OptionList
 
-from rsltrace_viewer.terminal.widgets.bars import background_of, node_style, set_virtual_size
+from rsltrace_viewer.terminal.widgets.bars import line_of, node_style, set_virtual_size
 
 STYLES = ("plain", "muted", "title", "good", "error", "warning", "link", "bar")
 Pieces = Sequence[tuple[str, str]]
@@ -24,6 +26,15 @@ _NODE = "node-"
 def node_piece(text: str, colour: int | None) -> tuple[str, str]:
     """Return a text in the colour of a node, if that has one."""
     return text, "plain" if colour is None else f"{_NODE}{colour}"
+
+
+class Choices(OptionList):
+    """A list of options that ``j`` and ``k`` move in as well."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("j", "cursor_down", show=False),
+        Binding("k", "cursor_up", show=False),
+    ]
 
 
 class ListView(ScrollView, can_focus=True, inherit_bindings=False):
@@ -45,8 +56,6 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
     """
 
     class Moved(Message):
-        """The cursor is at another line."""
-
         def __init__(self, line: int) -> None:
             super().__init__()
             self.line = line
@@ -66,7 +75,6 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
 
     @property
     def page(self) -> int:
-        """How many lines are in sight."""
         return max(self.scrollable_content_region.height, 1)
 
     def show(self, source: Callable[[int], Pieces], count: int) -> None:
@@ -88,13 +96,11 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         self.post_message(self.Moved(self.cursor))
 
     def scroll_to_cursor(self) -> None:
-        """Bring the cursor into sight."""
         if not round(self.scroll_y) <= self.cursor < round(self.scroll_y) + self.page:
             wanted = max(self.cursor - self.page // 2, 0)
             self.scroll_to(y=wanted, animate=False, force=True, immediate=True)
 
     def on_key(self, event: events.Key) -> None:
-        """Move, or choose."""
         steps = {
             "down": 1,
             "j": 1,
@@ -116,20 +122,11 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         event.stop()
 
     def on_click(self, event: events.Click) -> None:
-        """Choose the line that was clicked."""
         place = event.get_content_offset(self)
         line = round(self.scroll_y) + (place.y if place is not None else self.count)
         if line < self.count:
             self.go(line)
             self.post_message(self.Chosen(line))
-
-    def on_focus(self) -> None:
-        """Show the cursor."""
-        self.refresh()
-
-    def on_blur(self) -> None:
-        """Hide the cursor."""
-        self.refresh()
 
     def _style(self, name: str) -> Style:
         if name.startswith(_NODE):
@@ -138,17 +135,10 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         return self.get_component_rich_style(f"list--{name}")
 
     def render_line(self, y: int) -> Strip:
-        """Return line ``y`` of the widget."""
         line = round(self.scroll_y) + y
         width = self.scrollable_content_region.width
         if line >= self.count:
             return Strip([Piece(" " * width, self._style("plain"))], width)
         pieces = [Piece(text, self._style(name)) for text, name in self._source(line)]
-        strip = Strip(pieces)
-        if strip.cell_length > width:
-            strip = Strip([*strip.crop(0, width - 1), Piece("…", self._style("muted"))])
-        strip = strip.adjust_cell_length(width, self._style("plain"))
-        if self.has_focus and line == self.cursor:
-            over = background_of(self._style("cursor"))
-            return Strip([Piece(text, (old or over) + over) for text, old, _ in strip], width)
-        return strip
+        over = self._style("cursor") if self.has_focus and line == self.cursor else None
+        return line_of(pieces, width, self._style("plain"), more=self._style("muted"), over=over)

@@ -88,7 +88,6 @@ class Prompt(Vertical):
         self.display = False
 
     def compose(self) -> ComposeResult:
-        """Make the parts."""
         with Vertical(id="line"):
             yield Static(id="label")
             yield _Field(id="answer", select_on_focus=False, compact=True)
@@ -96,11 +95,9 @@ class Prompt(Vertical):
 
     @property
     def asking(self) -> bool:
-        """Whether a question is open."""
         return self._question is not None
 
     def ask(self, question: Question) -> None:
-        """Ask."""
         self._question = question
         self.query_one("#label", Static).update(f"{question.label} ")
         field = self.query_one(Input)
@@ -113,7 +110,6 @@ class Prompt(Vertical):
         self._say(question.value)
 
     def put_aside(self) -> None:
-        """Close without an answer."""
         self._close(None)
 
     def on_input_changed(self, event: Input.Changed) -> None:
@@ -122,7 +118,6 @@ class Prompt(Vertical):
         self._say(event.value)
 
     def answer(self) -> None:
-        """Answer, if the answer is good."""
         question, value = self._question, self.query_one(Input).value
         if question is None:
             return

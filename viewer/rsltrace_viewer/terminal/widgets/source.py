@@ -30,7 +30,6 @@ class SourceView(VerticalScroll, can_focus=True):
         self._shown: CallbackCode | None = None
 
     def compose(self) -> ComposeResult:
-        """Make the text."""
         yield Static(id="note")
         yield Static(id="code")
 

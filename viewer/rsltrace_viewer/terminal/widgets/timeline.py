@@ -16,7 +16,7 @@ from textual.strip import Strip
 from rsltrace.diff.row_sign import RowSign
 from rsltrace_viewer.model.timeline.columns import ColumnLayout, EventRow
 from rsltrace_viewer.model.view import fit
-from rsltrace_viewer.terminal.widgets.bars import background_of, node_style, set_virtual_size
+from rsltrace_viewer.terminal.widgets.bars import line_of, node_style, set_virtual_size
 
 _MARGIN = 3
 """Rows kept in sight above and below the cursor."""
@@ -79,8 +79,6 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     """
 
     class Picked(Message):
-        """A row was clicked."""
-
         def __init__(self, row: int) -> None:
             super().__init__()
             self.row = row
@@ -98,24 +96,20 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         self._source: Callable[[int], EventRow] | None = None
         self._count = 0
         self._columns = ColumnLayout()
-        self._styles: dict[str, Style] = {}
         self._drawn: dict[int, tuple[EventRow, bool]] = {}
         """What each row looked like when it was drawn last."""
 
     @property
     def page(self) -> int:
-        """How many rows are in sight."""
         return max(self.scrollable_content_region.height - 1, 1)
 
     @property
     def in_sight(self) -> range:
-        """The rows in sight."""
         top = round(self.scroll_y)
         return range(top, min(top + self.page + 1, self._count))
 
     @property
     def row_width(self) -> int:
-        """Cells of a row."""
         return self.scrollable_content_region.width
 
     def show(self, source: Callable[[int], EventRow], count: int, columns: ColumnLayout) -> None:
@@ -168,13 +162,7 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     def _look(self, row: int) -> tuple[EventRow, bool] | None:
         return (self._source(row), row == self.cursor) if self._source is not None else None
 
-    def notify_style_update(self) -> None:
-        """Forget the styles of the old theme."""
-        self._styles.clear()
-        super().notify_style_update()
-
     def on_resize(self, event: events.Resize) -> None:
-        """Lay out again."""
         set_virtual_size(self, Size(max(self.row_width, 1), self._count + 1))
         self.post_message(self.Resized())
 
@@ -187,21 +175,9 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         self.call_after_refresh(self.post_message, self.Scrolled())
 
     def on_click(self, event: events.Click) -> None:
-        """Select the row that was clicked."""
         row = round(self.scroll_y) + event.y - 1
         if event.y >= 1 and row < self._count:
             self.post_message(self.Picked(row))
-
-    def on_focus(self) -> None:
-        """Mark the titles."""
-        self._refresh_titles()
-
-    def on_blur(self) -> None:
-        """Mark the titles no more."""
-        self._refresh_titles()
-
-    def _refresh_titles(self) -> None:
-        self.refresh(Region(0, 0, self.size.width, 1))
 
     def _refresh_row(self, row: int) -> None:
         y = row - round(self.scroll_y) + 1
@@ -209,16 +185,9 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
             self.refresh(Region(0, y, self.size.width, 1))
 
     def _style(self, name: str) -> Style:
-        style = self._styles.get(name)
-        if style is None:
-            if name.startswith(_NODE):
-                style = self._style("plain") + node_style(self, int(name.removeprefix(_NODE)))
-            else:
-                style = self.get_component_rich_style(f"timeline--{name}")
-            if name in ("cursor", "related"):
-                style = background_of(style)
-            self._styles[name] = style
-        return style
+        if name.startswith(_NODE):
+            return self._style("plain") + node_style(self, int(name.removeprefix(_NODE)))
+        return self.get_component_rich_style(f"timeline--{name}")
 
     def render_line(self, y: int) -> Strip:
         """Return line ``y`` of the widget: the header, or a row."""
@@ -246,12 +215,9 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
                 colour = self._columns.colours.get(shown.event.node)
                 name = "muted" if colour is None else f"{_NODE}{colour}"
             pieces.append(Piece(text + " ", self._style(name)))
-        strip = Strip(pieces).adjust_cell_length(width, self._style("plain"))
-        over = "cursor" if selected else "related" if shown.related else ""
-        if not over:
-            return strip
-        style = self._style(over)
-        return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
+        name = "cursor" if selected else "related" if shown.related else ""
+        over = self._style(name) if name else None
+        return line_of(pieces, width, self._style("plain"), over=over)
 
 
 def _style_of(style: str, row: EventRow) -> str:
