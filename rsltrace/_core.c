@@ -24,8 +24,6 @@ enum {
   LARGE = 64 << 10, /* mcap/chunk_builder.LARGE_BYTES */
 };
 
-#define U8 0xFFu
-#define U16 0xFFFFu
 #define U32 0xFFFFFFFFu
 #define U64 UINT64_MAX
 
@@ -175,14 +173,14 @@ static const uint8_t *packed_bytes(PyObject *packed, Py_ssize_t wanted) {
 }
 
 /* Stores a number at the place of a row; returns whether it fits. */
-static int put(uint8_t *row, PyObject *value, uint64_t most, size_t size) {
+static int put(uint8_t *row, PyObject *value, size_t size) {
   const uint64_t number = PyLong_AsUnsignedLongLong(value);
   if (number == U64 && PyErr_Occurred()) {
     PyErr_Clear();
     return 0;
   }
   memcpy(row, &number, size);
-  return number <= most;
+  return number <= U64 >> (64 - 8 * size);
 }
 
 PyObject *attribute_of(const char *module_name, const char *name) {
@@ -246,7 +244,7 @@ static PyObject *add_payload(Buffer *self, PyObject *channel, PyObject *stamp, P
   length = size + HEADER - RECORD_HEAD;
   memcpy(header + 1, &length, 8);
   memcpy(header + 11, &number, 4);
-  if (number <= U32 && put(header + 9, channel, U16, 2) && put(header + 15, stamp, U64, 8))
+  if (number <= U32 && put(header + 9, channel, 2) && put(header + 15, stamp, 8))
     memcpy(header + 23, header + 15, 8);
   else if (pack_by("rsltrace.trace.mcap.records", "MESSAGE_HEAD", header, HEADER,
                    Py_BuildValue("inOKOO", MESSAGE, length, channel, number, stamp, stamp)) < 0)
@@ -298,13 +296,12 @@ static PyObject *buffer_add_output(Buffer *self, PyObject *packed) {
 
 static int add_sequence(Buffer *self, PyObject *sequence) {
   const unsigned long long value = PyLong_AsUnsignedLongLong(sequence);
-  uint32_t number = (uint32_t)value;
-  if (value == (unsigned long long)-1 && PyErr_Occurred()) return -1;
+  if (value == U64 && PyErr_Occurred()) return -1;
   if (value > U32) {
     PyErr_SetString(PyExc_OverflowError, "unsigned int is greater than maximum");
     return -1;
   }
-  return append(&self->numbers, &number, 4);
+  return append(&self->numbers, &value, 4);
 }
 
 static PyObject *buffer_add_sequence(Buffer *self, PyObject *sequence) {
@@ -467,8 +464,7 @@ static int add_row(Chain *self, const uint8_t *row) {
 
 static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, PyObject *kind) {
   uint8_t row[CONTENT];
-  if (!(put(row, content_hash, U64, 8) && put(row + 8, entity, U32, 4) &&
-        put(row + CONTENT_KIND, kind, U32, 4)) &&
+  if (!(put(row, content_hash, 8) && put(row + 8, entity, 4) && put(row + CONTENT_KIND, kind, 4)) &&
       pack_by("rsltrace.trace.format", "OUTPUT_CONTENT", row, CONTENT,
               Py_BuildValue("OOO", content_hash, entity, kind)) < 0)
     return -1;
@@ -510,8 +506,7 @@ static PyObject *chain_message(Chain *self, PyObject *const *args, Py_ssize_t co
   else if (self->buffer != NULL)
     sequence = add_payload(self->buffer, args[2], args[3], args[4]);
   else
-    sequence =
-        PyObject_CallFunctionObjArgs(self->add_payload, args[2], args[3], args[4], NULL);
+    sequence = PyObject_CallFunctionObjArgs(self->add_payload, args[2], args[3], args[4], NULL);
   if (sequence == NULL) return NULL;
   position = add_output(self, args[0], args[1], args[5], sequence);
   Py_DECREF(sequence);
@@ -519,17 +514,14 @@ static PyObject *chain_message(Chain *self, PyObject *const *args, Py_ssize_t co
 }
 
 static int pack_rest(Chain *self, PyObject *const *args, Py_ssize_t count, uint8_t *row) {
-  const uint64_t none = 0;
   const uint32_t outputs = (uint32_t)self->outputs;
-  const uint64_t index = self->index, output_hash = self->output_hash;
-  memcpy(row, &index, 8);
-  memcpy(row + 32, &output_hash, 8);
-  memcpy(row + 40, &none, 8);
+  memcpy(row, &self->index, 8);
+  memcpy(row + 32, &self->output_hash, 8);
   memcpy(row + REST_OUTPUTS, &outputs, 4);
-  if (outputs == self->outputs && put(row + 8, args[0], U64, 8) && put(row + 60, args[1], U8, 1) &&
-      put(row + 61, args[2], U8, 1) && put(row + 48, args[3], U32, 4) &&
-      put(row + 16, args[4], U64, 8) && put(row + 52, args[5], U32, 4) &&
-      put(row + 24, args[6], U64, 8) && (count < 8 || put(row + 40, args[7], U64, 8)))
+  if (outputs == self->outputs && put(row + 8, args[0], 8) && put(row + 60, args[1], 1) &&
+      put(row + 61, args[2], 1) && put(row + 48, args[3], 4) && put(row + 16, args[4], 8) &&
+      put(row + 52, args[5], 4) && put(row + 24, args[6], 8) &&
+      (count < 8 || put(row + 40, args[7], 8)))
     return 0;
   return pack_by("rsltrace.trace.format", "EVENT_REST", row, REST,
                  Py_BuildValue("KOOOKNOOKOO", self->index, args[0], args[4], args[6],
@@ -539,7 +531,7 @@ static int pack_rest(Chain *self, PyObject *const *args, Py_ssize_t count, uint8
 }
 
 static PyObject *chain_end_event(Chain *self, PyObject *const *args, Py_ssize_t count) {
-  uint8_t row[EVENT], *rest = row + 8;
+  uint8_t row[EVENT] = {0}, *rest = row + 8;
   if (check_count("end_event", count, 7, 8) < 0 || pack_rest(self, args, count, rest) < 0)
     return NULL;
   self->chain_hash = rest_hash64(rest, self->chain_hash);
@@ -598,7 +590,8 @@ PyTypeObject *event_type, *dispatcher_type, *entity_type;
 PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen; /* subclasses: see is_a */
 static PyTypeObject *sites_type, *chain_type;
 static PyObject *sites_seen, *publisher_seen, *node_seen, *chain_seen;
-static PyObject *deque_type, *deque_append, *deque_popleft, *hash64, *zero, *output_kind;
+static PyObject *deque_type, *hash64, *zero;
+static PyCFunction deque_append, deque_popleft;
 static PyObject *call_back, *heapreplace, *no_event, *no_args;
 static PyObject *callback_group, *active_entity, *user_callback, *timer_callback, *raw, *admitted;
 
@@ -687,6 +680,7 @@ PyMemberDef entity_fields[] = {
     FIELD(Entity, observers, "observers"),
     FIELD(Entity, count, "_count"),
     FIELD(Entity, channel, "_channel"),
+    FIELD(Entity, output_kind, "_output_kind"),
     FIELD(Entity, history, "_history"),
     FIELD(Entity, offers, "_offers"),
     FIELD(Entity, faults, "_faults"),
@@ -714,6 +708,20 @@ int set(PyObject **field, PyObject *value) {
   *field = value;
   Py_XDECREF(old);
   return 0;
+}
+
+/* Returns the function of a built-in method with such arguments, else NULL. */
+static PyCFunction function_of(PyObject *method, int flags) {
+  if (method == NULL || !PyCFunction_Check(method) || PyCFunction_GetFlags(method) != flags)
+    return NULL;
+  return PyCFunction_GetFunction(method);
+}
+
+/* Calls with one argument: directly what is built in, as a plan's methods are. */
+static PyObject *call_one(PyObject *callable, PyObject *argument) {
+  const PyCFunction function = function_of(callable, METH_O);
+  if (function != NULL) return function(PyCFunction_GetSelf(callable), argument);
+  return PyObject_CallFunctionObjArgs(callable, argument, NULL);
 }
 
 static int add_one(PyObject **field) {
@@ -748,26 +756,22 @@ static PyObject *state_hash_of(PyObject *node) {
 
 static int record_end(Dispatcher *self, PyObject *recorder, Loop *loop, Event *event,
                       PyObject *state_hash) {
-  PyObject *result;
   PyObject *row[] = {loop->now_ns,       event->kind,         event->flags,      event->entity,
                      event->cause_event, event->cause_output, event->input_hash, state_hash};
   if (recorder == Py_None) return set(&self->unrecorded, Py_NewRef(zero));
-  Py_INCREF(recorder);
   for (int i = 0; i < 8; ++i) Py_INCREF(row[i]);
-  if (is_a(recorder, chain_type, &chain_seen))
-    result = chain_end_event((Chain *)recorder, row, 8);
-  else
-    result = PyObject_CallMethod(recorder, "end_event", "OOOOOOOO", row[0], row[1], row[2], row[3],
-                                 row[4], row[5], row[6], row[7]);
+  PyObject *result = is_a(recorder, chain_type, &chain_seen)
+                         ? chain_end_event((Chain *)recorder, row, 8)
+                         : PyObject_CallMethod(recorder, "end_event", "OOOOOOOO", row[0], row[1],
+                                               row[2], row[3], row[4], row[5], row[6], row[7]);
   for (int i = 0; i < 8; ++i) Py_DECREF(row[i]);
-  Py_DECREF(recorder);
   return done(result);
 }
 
 int record_draw(PyObject *recorder, PyObject *entity, unsigned long long draw) {
   const uint32_t kind = DRAW;
   uint8_t row[CONTENT];
-  if (!is_a(recorder, chain_type, &chain_seen) || !put(row + 8, entity, U32, 4))
+  if (!is_a(recorder, chain_type, &chain_seen) || !put(row + 8, entity, 4))
     return done(PyObject_CallMethod(recorder, "draw", "OK", entity, draw));
   memcpy(row, &draw, 8);
   memcpy(row + CONTENT_KIND, &kind, 4);
@@ -831,19 +835,14 @@ enum { HANDLE, ENTITY, NODE, KIND, CALLBACK, ARGS, CAUSE_EVENT, CAUSE_OUTPUT, IN
 /* What calls the callback is Python, as who looks at the stack finds its frame there, and what a
    callback raises passes through it. */
 static int run_event(Dispatcher *self, PyObject *const *call) {
+  static const int begins[] = {HANDLE, ENTITY, NODE, KIND, CAUSE_EVENT, CAUSE_OUTPUT, INPUT_HASH};
   Event *event;
   int failed;
   if (!HAS_FIELDS(self, Dispatcher, dispatcher) || !HAS_FIELDS(self->event, Event, event))
     return -1;
   event = (Event *)Py_NewRef(self->event);
-  failed = set(&event->handle, Py_NewRef(call[HANDLE])) < 0 ||
-           set(&event->entity, Py_NewRef(call[ENTITY])) < 0 ||
-           set(&event->node, Py_NewRef(call[NODE])) < 0 ||
-           set(&event->kind, Py_NewRef(call[KIND])) < 0 ||
-           set(&event->cause_event, Py_NewRef(call[CAUSE_EVENT])) < 0 ||
-           set(&event->cause_output, Py_NewRef(call[CAUSE_OUTPUT])) < 0 ||
-           set(&event->input_hash, Py_NewRef(call[INPUT_HASH])) < 0 ||
-           done(PyObject_CallMethodObjArgs((PyObject *)self, call_back, call[HANDLE],
+  for (int i = 0; i < 7; ++i) set(&event->handle + i, Py_NewRef(call[begins[i]]));
+  failed = done(PyObject_CallMethodObjArgs((PyObject *)self, call_back, call[HANDLE],
                                            call[CALLBACK], call[ARGS], NULL)) < 0 ||
            end_event(self) < 0 || !HAS_FIELDS(event, Event, event);
   if (!failed && event->on_end != Py_None) {
@@ -882,13 +881,15 @@ static PyMethodDef dispatcher_methods[] = {
 
 /* -- Publisher ---------------------------------------------------------------------------------- */
 
+/* Whether an object, or NULL, is what the functions of a deque take: they do not look. */
+static int is_deque(PyObject *queue) {
+  return queue != NULL && (PyObject *)Py_TYPE(queue) == deque_type;
+}
+
 int append_to(PyObject *queue, PyObject *item) {
-  int failed;
   Py_INCREF(queue);
-  if ((PyObject *)Py_TYPE(queue) == deque_type)
-    failed = done(PyObject_CallFunctionObjArgs(deque_append, queue, item, NULL));
-  else
-    failed = done(PyObject_CallMethod(queue, "append", "(O)", item));
+  const int failed = done(is_deque(queue) ? deque_append(queue, item)
+                                          : PyObject_CallMethod(queue, "append", "(O)", item));
   Py_DECREF(queue);
   return failed;
 }
@@ -953,15 +954,11 @@ static int send_to_all(Entity *self, PyObject *const *message, PyObject *now_ns,
 /* Records a message; returns its digest and its position in the event. */
 static int record_message(Entity *self, PyObject *recorder, PyObject *now_ns, PyObject *data,
                           PyObject *content_hash, PyObject **digest, PyObject **position) {
-  PyObject *kind, *row[6];
+  PyObject *row[6];
   *digest = content_hash != Py_None ? Py_NewRef(content_hash)
                                     : PyObject_CallFunctionObjArgs(hash64, data, NULL);
-  kind = *digest == NULL ? NULL : PyObject_GetAttr((PyObject *)self, output_kind);
-  if (kind == NULL || !is_publisher((PyObject *)self)) {
-    Py_XDECREF(kind);
-    return -1;
-  }
-  row[0] = kind;
+  if (*digest == NULL || !is_publisher((PyObject *)self)) return -1;
+  row[0] = Py_NewRef(self->output_kind);
   row[1] = Py_NewRef(self->entity_id);
   row[2] = Py_NewRef(self->channel);
   row[3] = Py_NewRef(now_ns);
@@ -1007,8 +1004,7 @@ static PyObject *publisher_send(Entity *self, PyObject *const *args, Py_ssize_t 
   PyObject *content_hash, *recorder;
   Dispatcher *dispatcher;
   int failed;
-  if (check_count("send", count, 1, 2) < 0 || !is_publisher((PyObject *)self))
-    return NULL;
+  if (check_count("send", count, 1, 2) < 0 || !is_publisher((PyObject *)self)) return NULL;
   dispatcher = (Dispatcher *)self->dispatcher;
   if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) return NULL;
   content_hash = count > 1 ? args[1] : Py_None;
@@ -1051,7 +1047,7 @@ static PyObject *publisher_publish(Entity *self, PyObject *message) {
   if (due || self->serialize == NULL)
     return PyObject_CallMethod((PyObject *)self, "publish_any", "(O)", message);
   serialize = Py_NewRef(self->serialize);
-  data = PyObject_CallFunctionObjArgs(serialize, message, NULL);
+  data = call_one(serialize, message);
   Py_DECREF(serialize);
   result = data == NULL ? NULL : publisher_send(self, &data, 1);
   Py_XDECREF(data);
@@ -1151,7 +1147,7 @@ static int run_subscription(Entity *self, PyObject *delivery) {
   PyObject *callback = Py_NewRef(self->callback), *deserialize = Py_NewRef(self->deserialize);
   PyObject *message, *args, *cause[3];
   int failed = 1;
-  message = PyObject_CallFunctionObjArgs(deserialize, PyTuple_GetItem(delivery, 4), NULL);
+  message = call_one(deserialize, PyTuple_GetItem(delivery, 4));
   args = message == NULL ? NULL : PyTuple_Pack(1, message);
   Py_XDECREF(message);
   for (int i = 0; i < 3; ++i) cause[i] = PyTuple_GetItem(delivery, 5 + i);
@@ -1165,14 +1161,13 @@ static int run_subscription(Entity *self, PyObject *delivery) {
 static PyObject *subscription_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
   PyObject *delivery;
   int failed = 1, usual = 0;
-  if (self->queue != NULL && (PyObject *)Py_TYPE(self->queue) == deque_type &&
-      PyObject_Length(self->queue) > 0)
+  if (is_deque(self->queue) && PyObject_Length(self->queue) > 0)
     usual = is_usual(self, user_callback);
   if (usual > 0) usual = is_admitted(self);
   if (usual < 0) return NULL;
-  if (!usual || self->queue == NULL || self->callback == NULL || self->deserialize == NULL)
+  if (!usual || !is_deque(self->queue) || self->callback == NULL || self->deserialize == NULL)
     return PyObject_CallMethod((PyObject *)self, "dispatch_any", NULL);
-  delivery = PyObject_CallFunctionObjArgs(deque_popleft, self->queue, NULL);
+  delivery = deque_popleft(self->queue, NULL);
   if (delivery == NULL) return NULL;
   if (PyTuple_Check(delivery) && PyTuple_Size(delivery) == 10)
     failed = run_subscription(self, delivery);
@@ -1301,15 +1296,19 @@ static PyTypeObject *entity_with(PyMethodDef *methods, const char *name) {
 }
 
 static int add_types(PyObject *module) {
+  PyObject *deque;
   deque_type = attribute_of("collections", "deque");
-  deque_append = deque_type == NULL ? NULL : PyObject_GetAttrString(deque_type, "append");
-  deque_popleft = deque_type == NULL ? NULL : PyObject_GetAttrString(deque_type, "popleft");
+  deque = deque_type == NULL ? NULL : PyObject_CallObject(deque_type, NULL);
+  if (deque == NULL) return -1;
+  deque_append = function_of(PyObject_GetAttrString(deque, "append"), METH_O);
+  deque_popleft = function_of(PyObject_GetAttrString(deque, "popleft"), METH_NOARGS);
+  if (deque_append == NULL || deque_popleft == NULL)
+    PyErr_SetString(PyExc_ImportError, "a deque has other methods");
   hash64 = attribute_of("xxhash", "xxh3_64_intdigest");
   heapreplace = attribute_of("heapq", "heapreplace");
   no_event = PyLong_FromUnsignedLongLong(U64);
   no_args = PyTuple_New(0);
   zero = PyLong_FromLong(0);
-  output_kind = PyUnicode_InternFromString("output_kind");
   call_back = PyUnicode_InternFromString("call_back");
   callback_group = PyUnicode_InternFromString("callback_group");
   active_entity = PyUnicode_InternFromString("_active_entity");

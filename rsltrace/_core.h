@@ -46,7 +46,8 @@ typedef struct {
   PyObject *node, *destroyed, *wrapper, *own_group, *mailbox;
   PyObject *callback, *coroutine, *with_info, *deserialize, *serialize, *sites;
   PyObject *dispatcher, *entity_id; /* from here on what a publisher has */
-  PyObject *subscriptions, *links, *observers, *count, *channel, *history, *offers, *faults;
+  PyObject *subscriptions, *links, *observers, *count, *channel, *output_kind, *history;
+  PyObject *offers, *faults;
 } Entity;
 
 typedef struct {

@@ -318,6 +318,33 @@ def test_a_timer_whose_objects_somebody_else_holds_does_not_crash(simulate: Any)
     assert held
 
 
+def test_a_queue_that_is_replaced_while_it_is_looked_at_does_not_crash(simulate: Any) -> None:
+    heard: list[Any] = []
+
+    class Replaces(Node):
+        def __init__(self) -> None:
+            super().__init__("replaces")
+            self.out = self.create_publisher(UInt64, "numbers", 10)
+            self.sub = self.create_subscription(UInt64, "numbers", heard.append, 10)
+            handle, group = self.sub.handle, self.sub.callback_group
+
+            def look(sub: Any) -> Any:
+                if heard and handle.queue:
+                    handle.queue = list(handle.queue)
+                return group
+
+            looking = property(look, lambda sub, value: None)
+            self.sub.__class__ = type("Looking", (type(self.sub),), {"callback_group": looking})
+            self.create_timer(0.1, lambda: self.out.publish(UInt64()))
+
+    with pytest.raises((AttributeError, RunError), match="'list' object has no attribute"):
+        simulate(Replaces, duration=1)
+    assert heard
+
+
+FIELDS = ("_serialize", "_sites", "_count", "_output_kind", "dispatcher", "entity_id")
+
+
 def test_a_publisher_that_has_lost_a_field_does_not_crash(simulate: Any) -> None:
     refused: list[str] = []
 
@@ -327,7 +354,7 @@ def test_a_publisher_that_has_lost_a_field_does_not_crash(simulate: Any) -> None
             self.create_timer(0.1, self.tick)
 
         def tick(self) -> None:
-            for field in ("_serialize", "_sites", "_count", "dispatcher", "entity_id"):
+            for field in FIELDS:
                 handle = self.create_publisher(UInt64, "numbers", 10).handle
                 kept = getattr(handle, field)
                 delattr(handle, field)
@@ -340,4 +367,4 @@ def test_a_publisher_that_has_lost_a_field_does_not_crash(simulate: Any) -> None
                 setattr(handle, field, kept)
 
     simulate(Breaks, duration=0.1)
-    assert len(refused) == 5
+    assert len(refused) == len(FIELDS)

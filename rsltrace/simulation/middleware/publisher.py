@@ -95,6 +95,7 @@ class Publisher(DomainEntity, PublisherFields):
             self.links = []
         self._count = 0
         self._channel: int | None = None
+        self._output_kind = self.output_kind
         self.observers = transport.observers.get(topic)
         self._history: deque[Delivery] | None = None
         if self.qos.durability is Durability.TRANSIENT_LOCAL or self.dispatcher.loop.keeps_all:
@@ -127,7 +128,7 @@ class Publisher(DomainEntity, PublisherFields):
             if channel is None:
                 channel = self._open_channel()
             position = recorder.message(
-                self.output_kind, self.entity_id, channel, now_ns, data, digest
+                self._output_kind, self.entity_id, channel, now_ns, data, digest
             )
         event, count = loop.events, self._count
         loop.activity_ns = now_ns
