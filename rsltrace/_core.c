@@ -586,11 +586,13 @@ static PyType_Spec chain_spec = {
 
 /* -- fields ------------------------------------------------------------------------------------- */
 
-PyTypeObject *event_type, *dispatcher_type, *entity_type;
-PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen; /* subclasses: see is_a */
-static PyTypeObject *sites_type, *chain_type;
-static PyObject *sites_seen, *publisher_seen, *node_seen, *chain_seen;
-static PyObject *deque_type, *hash64, *zero;
+PyTypeObject *event_type, *dispatcher_type, *entity_type, *timers_type;
+/* Subclasses: see is_a. */
+PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen, *timers_seen;
+PyObject *deque_type;
+static PyTypeObject *sites_type, *chain_type, *timer_type;
+static PyObject *sites_seen, *timer_seen, *publisher_seen, *node_seen, *chain_seen;
+static PyObject *hash64, *zero;
 static PyCFunction deque_append, deque_popleft;
 static PyObject *call_back, *heapreplace, *no_event, *no_args;
 static PyObject *callback_group, *active_entity, *user_callback, *timer_callback, *raw, *admitted;
@@ -599,14 +601,6 @@ typedef struct {
   PyObject_HEAD
   PyObject *period_ns, *order, *deadline_ns, *ticket, *last_call_ns;
 } TimerState;
-
-typedef struct {
-  PyObject_HEAD
-  PyObject *heap, *head, *next_ns;
-} TimerQueue;
-
-static PyTypeObject *timer_type, *timers_type;
-static PyObject *timer_seen, *timers_seen;
 
 FIELDS(Event, event, "EventFields")
 FIELDS(Dispatcher, dispatcher, "EventEnd")

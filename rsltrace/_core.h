@@ -55,8 +55,14 @@ typedef struct {
   PyObject *due, *running;
 } Sites;
 
-extern PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type;
-extern PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen;
+typedef struct {
+  PyObject_HEAD
+  PyObject *heap, *head, *next_ns;
+} TimerQueue;
+
+extern PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type, *timers_type;
+extern PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen, *timers_seen;
+extern PyObject *deque_type;
 extern PyMemberDef loop_fields[], event_fields[], dispatcher_fields[], entity_fields[];
 
 #define FIELD_COUNT(Struct) ((sizeof(Struct) - sizeof(PyObject)) / sizeof(PyObject *))

@@ -14,7 +14,7 @@ PyTypeObject *loop_type;
 static PyTypeObject *link_type;
 static PyObject *link_seen;
 static PyObject *heappush, *heappop, *order_release, *minus_one;
-static PyObject *next_ns_name, *popleft_name, *send_name;
+static PyObject *popleft_name, *send_name;
 
 FIELDS(WholeLoop, loop, "LoopFields")
 FIELDS(Link, link, "LinkFields")
@@ -211,53 +211,38 @@ static PyMethodDef link_methods[] = {
 
 /* -- time steps ---------------------------------------------------------------------------------- */
 
-/* Returns a number, or 2**63 in place of more; -1 with an error. */
-static __int128 number_of(PyObject *value) {
-  int overflow;
-  Py_XINCREF(value);
-  const long long number = PyLong_AsLongLongAndOverflow(value, &overflow);
-  Py_XDECREF(value);
-  return overflow > 0 ? (__int128)INT64_MAX + 1 : number;
-}
+enum { NOW, NEXT, TIMER, QUIET, EVENTS, UNTIL, STEP, NUMBERS };
 
-static Py_ssize_t size_of(PyObject *queue) {
-  Py_ssize_t size;
-  Py_XINCREF(queue);
-  size = PyObject_Size(queue);
-  Py_XDECREF(queue);
-  return size;
-}
-
-/* Returns the time of the first release; -1 if there is none, or with an error. */
-static __int128 first_ns(WholeLoop *self) {
-  PyObject *first = Py_None;
-  if (PyList_Check(self->scheduled)) {
-    if (PyList_Size(self->scheduled) == 0) return -1;
-    first = PyList_GetItem(self->scheduled, 0);
+/* Whether the next arrival is all that the loop has to look at; -1 if only Python can tell. It runs
+   no code of Python: there are only lists, deques and whole numbers. */
+static int is_next(const WholeLoop *self) {
+  const TimerQueue *timers = (TimerQueue *)self->timers;
+  PyObject *ready = self->of_events.ready, *first;
+  int64_t numbers[NUMBERS];
+  if ((PyObject *)Py_TYPE(ready) != deque_type || (PyObject *)Py_TYPE(self->tasks) != deque_type ||
+      !PyList_CheckExact(self->idle) || !PyList_CheckExact(self->scheduled) ||
+      !is_a(self->timers, timers_type, &timers_seen) || timers->next_ns == NULL)
+    return -1;
+  if (PyList_Size(self->scheduled) == 0 || PyObject_Size(ready) || PyObject_Size(self->tasks) ||
+      PyList_Size(self->idle) || self->gate != Py_None)
+    return 0;
+  first = PyList_GetItem(self->scheduled, 0);
+  if (!PyTuple_CheckExact(first) || PyTuple_Size(first) < 4) return -1;
+  PyObject *all[NUMBERS] = {
+      [NOW] = self->of_events.now_ns,    [NEXT] = PyTuple_GetItem(first, 0),
+      [TIMER] = timers->next_ns,         [QUIET] = self->quiet_ns,
+      [EVENTS] = self->of_events.events, [UNTIL] = self->until_events,
+      [STEP] = self->min_step_ns,
+  };
+  for (int i = 0; i < NUMBERS; ++i) {
+    int overflow;
+    if (!PyLong_CheckExact(all[i])) return -1;
+    numbers[i] = PyLong_AsLongLongAndOverflow(all[i], &overflow);
+    if (overflow) numbers[i] = overflow > 0 ? INT64_MAX : INT64_MIN;
   }
-  if (PyTuple_Check(first) && PyTuple_Size(first) > 3) return number_of(PyTuple_GetItem(first, 0));
-  PyErr_SetString(PyExc_TypeError, "what is scheduled is no release");
-  return -1;
-}
-
-static __int128 next_timer_ns(WholeLoop *self) {
-  PyObject *timers = Py_NewRef(self->timers);
-  PyObject *value = PyObject_GetAttr(timers, next_ns_name);
-  const __int128 next_ns = value == NULL ? -1 : number_of(value);
-  Py_XDECREF(value);
-  Py_DECREF(timers);
-  return next_ns;
-}
-
-/* Whether the next arrival is all that the loop has to look at; not so, possibly, with an error. */
-static int is_next(WholeLoop *self) {
-  const __int128 next_ns = first_ns(self);
-  return next_ns >= 0 && size_of(self->of_events.ready) == 0 && size_of(self->tasks) == 0 &&
-         size_of(self->idle) == 0 && self->gate == Py_None &&
-         next_ns > number_of(self->of_events.now_ns) && next_ns < number_of(self->quiet_ns) &&
-         number_of(self->of_events.events) < number_of(self->until_events) &&
-         number_of(self->min_step_ns) == 0 && HAS_FIELDS(self, WholeLoop, loop) &&
-         next_ns < next_timer_ns(self);
+  if (numbers[NEXT] == INT64_MAX) return -1;
+  return numbers[NOW] < numbers[NEXT] && numbers[NEXT] < numbers[TIMER] &&
+         numbers[NEXT] < numbers[QUIET] && numbers[EVENTS] < numbers[UNTIL] && numbers[STEP] == 0;
 }
 
 static PyObject *receiver_of(PyObject *release) {
@@ -271,36 +256,52 @@ static PyObject *receiver_of(PyObject *release) {
   return receiver;
 }
 
+/* Whether another release is due; -1 with an error. */
+static int is_due(WholeLoop *self) {
+  PyObject *first = Py_None, *now_ns;
+  int due;
+  if (PyList_Check(self->scheduled)) {
+    if (PyList_Size(self->scheduled) == 0) return 0;
+    first = PyList_GetItem(self->scheduled, 0);
+  }
+  if (!PyTuple_Check(first) || PyTuple_Size(first) < 4) {
+    PyErr_SetString(PyExc_TypeError, "what is scheduled is no release");
+    return -1;
+  }
+  first = Py_NewRef(PyTuple_GetItem(first, 0));
+  now_ns = Py_NewRef(self->of_events.now_ns);
+  due = PyObject_RichCompareBool(first, now_ns, Py_LE);
+  Py_DECREF(now_ns);
+  Py_DECREF(first);
+  return due;
+}
+
 /* Lets the arrival and the others of its time be dispatched in order; returns who is next. */
 static PyObject *first_ready(WholeLoop *self, PyObject *receiver) {
   PyObject *ready = Py_NewRef(self->of_events.ready), *first = NULL;
-  const __int128 next_ns = first_ns(self);
-  const int is_due = next_ns >= 0 && next_ns <= number_of(self->of_events.now_ns);
-  if (!PyErr_Occurred()) {
-    if (is_due)
-      first = receiver != Py_None && append_to(ready, receiver) < 0 ? NULL : Py_NewRef(Py_None);
-    else if (receiver != Py_None || PyObject_Size(ready) <= 0)
-      first = PyErr_Occurred() ? NULL : Py_NewRef(receiver);
-    else
-      first = PyObject_CallMethodObjArgs(ready, popleft_name, NULL);
-  }
+  const int due = is_due(self);
+  if (due > 0)
+    first = receiver != Py_None && append_to(ready, receiver) < 0 ? NULL : Py_NewRef(Py_None);
+  else if (due == 0 && (receiver != Py_None || PyObject_Size(ready) <= 0))
+    first = PyErr_Occurred() ? NULL : Py_NewRef(receiver);
+  else if (due == 0)
+    first = PyObject_CallMethodObjArgs(ready, popleft_name, NULL);
   Py_DECREF(ready);
   return first;
 }
 
 static PyObject *loop_next_arrival(WholeLoop *self, PyObject *Py_UNUSED(none)) {
   PyObject *heap, *release, *receiver, *first = NULL;
-  const int is_it = HAS_FIELDS(self, WholeLoop, loop) && is_next(self);
-  if (PyErr_Occurred() || !HAS_FIELDS(self, WholeLoop, loop)) return NULL;
+  if (!HAS_FIELDS(self, WholeLoop, loop)) return NULL;
+  const int is_it = is_next(self);
+  if (is_it < 0) return PyObject_CallMethod((PyObject *)self, "python_next_arrival", NULL);
   if (!is_it) return Py_NewRef(Py_False);
   heap = Py_NewRef(self->scheduled);
   release = PyObject_CallFunctionObjArgs(heappop, heap, NULL);
   Py_DECREF(heap);
   if (release == NULL) return NULL;
-  if (!PyTuple_Check(release) || PyTuple_Size(release) < 4) {
-    PyErr_SetString(PyExc_TypeError, "what is scheduled is no release");
-  } else if (set(&self->of_events.now_ns, Py_NewRef(PyTuple_GetItem(release, 0))) == 0 &&
-             set(&self->looks_at, Py_NewRef(minus_one)) == 0) {
+  if (set(&self->of_events.now_ns, Py_NewRef(PyTuple_GetItem(release, 0))) == 0 &&
+      set(&self->looks_at, Py_NewRef(minus_one)) == 0) {
     receiver = receiver_of(release);
     if (receiver != NULL && HAS_FIELDS(self, WholeLoop, loop)) first = first_ready(self, receiver);
     Py_XDECREF(receiver);
@@ -319,7 +320,6 @@ int add_loop_types(PyObject *module) {
   heappop = attribute_of("heapq", "heappop");
   order_release = PyLong_FromLong(1);
   minus_one = PyLong_FromLong(-1);
-  next_ns_name = PyUnicode_InternFromString("next_ns");
   popleft_name = PyUnicode_InternFromString("popleft");
   send_name = PyUnicode_InternFromString("send");
   loop_type = loop_made(loop_fields, loop_methods);
