@@ -385,8 +385,9 @@ class RunSession:
         return payload_filter(self.job)
 
     def _interrupt(self, stop: Stop) -> None:
-        """End the run after the current event, or within it if it does not return."""
+        """End the run at a signal: after the current event, or within it if it does not return."""
         self.loop.stop(stop)
+        self._watchdog.signal = stop.exit_code - 128
         if self._watchdog.has_warned:
             raise KeyboardInterrupt
 

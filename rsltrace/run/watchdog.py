@@ -1,7 +1,8 @@
 """Warn about a callback that does not return: which one, and at which line it is.
 
 Simulated time stands still during a callback, so an endless one would hang a run in silence. A
-thread looks every two seconds of real time whether anything has happened.
+thread looks every two seconds of real time whether anything has happened. It interrupts a callback
+that goes on after a signal has ended the run: ``timeout`` and ``docker stop`` send only one.
 
 It must not influence the run. So it touches nothing but numbers as long as all is well, and keeps
 no object of the run alive between looks: addresses decide the order of some sets. It counts its
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import os
 import sys
-from _thread import allocate_lock, start_new_thread
+from _thread import allocate_lock, interrupt_main, start_new_thread
 from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 LOOK_EVERY_S = 2.0
 _LOOKS_BEFORE_NOTE = 5
 _LOOKS_BETWEEN_NOTES = 30
+_LOOKS_BEFORE_END = 3
+"""Some five seconds after a signal: docker kills after ten."""
 _LOOKS_MAX = 250
 """Longer is not counted. (Python keeps one object of each number up to this forever.)"""
 
@@ -47,6 +50,8 @@ class Watchdog:
         self._process = os.getpid()
         self.has_warned = False
         """Whether a note on the current callback was printed."""
+        self.signal = 0
+        """The signal that has ended the run, if one has."""
         self._running = False
         self._stopping = allocate_lock()
         self._ended = allocate_lock()
@@ -76,7 +81,7 @@ class Watchdog:
 
     def _look(self, ready: object) -> None:
         seen = array("q", (-1, -1))
-        still, since_note = 0, _LOOKS_BETWEEN_NOTES
+        still, since_note, ending = 0, _LOOKS_BETWEEN_NOTES, 0
         ready.release()  # type: ignore[attr-defined]
         del ready
         while not self._stopping.acquire(timeout=LOOK_EVERY_S):
@@ -87,6 +92,9 @@ class Watchdog:
                 seen[0], seen[1] = loop.events, loop.now_ns
                 still, self.has_warned = 0, False
             del loop
+            ending += bool(self.signal and still)
+            if ending == _LOOKS_BEFORE_END and still:
+                interrupt_main(self.signal)  # type: ignore[arg-type]  # a number will do
             since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
             if still >= _LOOKS_BEFORE_NOTE and since_note == _LOOKS_BETWEEN_NOTES:
                 with suppress(Exception):

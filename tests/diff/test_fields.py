@@ -532,3 +532,11 @@ def test_rounded_numbers_of_a_row_are_not_further_from_each_other_than_the_exact
     received = replace(one, position=-1)
     assert event_differences_text([received]) == f"got /t {text}"
     assert event_differences_text([received], brief=True) == f"got /t {brief}"
+
+
+def test_what_was_drawn_in_one_run_only_does_not_read_as_an_event_in_one_run_only() -> None:
+    fields = (FieldDifference("draw", "none", "lost"),)
+    one = MessageDifference(
+        OutputKind.DRAW, "subscription /t", "", 1, Presence.ONLY_B, None, 2, fields
+    )
+    assert event_differences_text([one], brief=True) == "draw none → lost"

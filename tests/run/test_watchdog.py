@@ -260,7 +260,10 @@ def test_it_is_gone_after_the_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_ctrl_c_twice_ends_a_busy_loop_with_a_whole_trace(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "times"), [(signal.SIGINT, 2), (signal.SIGTERM, 1)])
+def test_signals_end_a_busy_loop_with_a_whole_trace(
+    tmp_path: Path, number: signal.Signals, times: int
+) -> None:
     (tmp_path / "busy_node.py").write_text(
         "from rclpy.node import Node\n"
         "class Busy(Node):\n"
@@ -277,12 +280,12 @@ def test_ctrl_c_twice_ends_a_busy_loop_with_a_whole_trace(tmp_path: Path) -> Non
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         while process.poll() is None and not (tmp_path / "reached").exists():
             time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         assert process.stderr is not None
         for line in process.stderr:
-            if "repeat to force" in line:
-                process.send_signal(signal.SIGINT)
-    assert process.returncode == 130
+            if "repeat to force" in line and times == 2:
+                process.send_signal(number)
+    assert process.returncode == 128 + number
     with rsltrace.Trace.open(tmp_path / "run.mcap") as trace:
         assert trace.complete
         assert trace.event(1).flags.name == "RAISED"

@@ -83,6 +83,12 @@ def test_a_folder_in_which_no_file_can_be_created_is_named() -> None:
         TraceWriter(Path("/proc/x.mcap"), force=False)
 
 
+def test_a_link_that_leads_nowhere_is_named(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").symlink_to("/nowhere/x.mcap")
+    with pytest.raises(OutputError, match=r"it is a link to /nowhere/x\.mcap"):
+        TraceWriter(tmp_path / "run.mcap", force=False)
+
+
 @pytest.mark.parametrize("force", [False, True])
 def test_a_folder_is_no_file(tmp_path: Path, force: bool) -> None:
     with pytest.raises(OutputError, match="it is a folder"):

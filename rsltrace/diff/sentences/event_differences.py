@@ -43,7 +43,7 @@ def _message_text(one: MessageDifference, *, brief: bool) -> tuple[str, str]:
         topic = f"{_CALLS[one.kind]} {topic}"
     if one.position < 0:
         topic = f"got {topic}"
-    if one.presence is not Presence.BOTH:
+    if one.presence is not Presence.BOTH and not one.fields:  # it has: what was drawn for it
         return topic, shortened(f"{one.preview} {IN_ONE[one.presence]}".strip(), 80)
     if not one.fields:
         return topic, no_fields_text(one) or "differs"

@@ -301,4 +301,6 @@ def _why_not_created(path: Path, error: OSError) -> str:
     reason = error.strerror or str(error)
     if error.errno == errno.ENOENT:
         reason = f"no file can be created in {folder}"
+        if path.is_symlink():
+            reason = f"it is a link to {os.readlink(path)}, which cannot be created"
     return f"cannot write the trace {path}: {reason}; choose another place with -o"
