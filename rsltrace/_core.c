@@ -1297,7 +1297,7 @@ static int add_types(PyObject *module) {
   deque_append = function_of(PyObject_GetAttrString(deque, "append"), METH_O);
   deque_popleft = function_of(PyObject_GetAttrString(deque, "popleft"), METH_NOARGS);
   if (deque_append == NULL || deque_popleft == NULL)
-    PyErr_SetString(PyExc_ImportError, "a deque has other methods");
+    return PyErr_SetString(PyExc_ImportError, "a deque has other methods"), -1;
   hash64 = attribute_of("xxhash", "xxh3_64_intdigest");
   heapreplace = attribute_of("heapq", "heapreplace");
   no_event = PyLong_FromUnsignedLongLong(U64);

@@ -300,7 +300,7 @@ static PyObject *loop_next_arrival(WholeLoop *self, PyObject *Py_UNUSED(none)) {
   release = PyObject_CallFunctionObjArgs(heappop, heap, NULL);
   Py_DECREF(heap);
   if (release == NULL) return NULL;
-  if (set(&self->of_events.now_ns, Py_NewRef(PyTuple_GetItem(release, 0))) == 0 &&
+  if (set(&self->of_events.now_ns, Py_XNewRef(PyTuple_GetItem(release, 0))) == 0 &&
       set(&self->looks_at, Py_NewRef(minus_one)) == 0) {
     receiver = receiver_of(release);
     if (receiver != NULL && HAS_FIELDS(self, WholeLoop, loop)) first = first_ready(self, receiver);
