@@ -22,6 +22,7 @@ from rsltrace.cli.job_source import (
     source_name,
 )
 from rsltrace.cli.options import history_option, job_folder_option, trust_option
+from rsltrace.cli.output.exit_status import interrupted_status
 from rsltrace.cli.record import default_output
 from rsltrace.cli.verify import JobArguments, handling_signals
 from rsltrace.errors import ExploreError
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 
 STRATEGIES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
 _FORMAT = 1
-_INTERRUPTED = 130
 
 
 def _budget(context: click.Context, option: click.Parameter, text: str) -> SearchBudget:
@@ -257,13 +257,13 @@ def explore(
                 fork_ns=-1 if fork_after is None else fork_after[1],
             )
             end = _SearchReport(search, source, folder, strategy, form, quiet=quiet)
-            interrupted = False
+            interrupted = 0
             with search, _pool(source, job, jobs, cluster) as pool:
                 try:
                     with _telling(search, budget, quiet=quiet) as on_result:
                         search.run(pool, on_result)
-                except KeyboardInterrupt:
-                    interrupted = True
+                except KeyboardInterrupt as interrupt:
+                    interrupted = interrupted_status(interrupt)
                 except ExploreError:
                     if search.tally.runs:
                         end.report(job)
@@ -276,7 +276,7 @@ def explore(
             if record.verdict != "failed":
                 record.runs = 0  # one that is cut off says nothing else: no line
             tell(f"interrupted: continue with --resume; the results are in {folder}")
-            return _INTERRUPTED
+            return interrupted
         return 1 if search.tally.failures else 0
 
 

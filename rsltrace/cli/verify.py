@@ -281,10 +281,10 @@ def _one_run(
 
 @contextmanager
 def handling_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the child processes, too."""
+    """Let SIGTERM and SIGHUP end the command as Ctrl-C does: with its child processes."""
 
     def end(number: int, frame: object) -> None:
-        sys.exit(128 + number)
+        raise KeyboardInterrupt(128 + number)
 
     caught = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(number, end) for number in caught]

@@ -108,6 +108,27 @@ def test_a_search_that_is_killed_goes_on_where_it_was(
     assert sorted(numbers) == list(range(24))
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_search_that_is_ended_says_what_it_found(
+    write_job: Callable[[str, str], Path], tmp_path: Path, number: signal.Signals
+) -> None:
+    job, folder = write_job("ended", CHECKED), tmp_path / "ended"
+    words = ["explore", str(job), "--budget", "10000", "-o", str(folder)]
+    command = [sys.executable, "-m", "rsltrace", *words]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+        table = folder / "results.jsonl"
+        while not table.exists() or table.read_bytes().count(b"\n") < 6:
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.send_signal(number)
+        found, told = process.communicate(timeout=600)
+    assert process.returncode == 128 + number
+    assert f"interrupted: continue with --resume; the results are in {folder}" in told
+    assert f"results: {folder}; report: {folder / 'report.html'}" in found
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

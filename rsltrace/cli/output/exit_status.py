@@ -108,7 +108,7 @@ def status_of(command: Callable[[], object]) -> int:
         tell(shown.getvalue(), end="")
         status = error.exit_code
     except (KeyboardInterrupt, click.Abort) as end:
-        status = _interrupted(end)
+        status = interrupted_status(end)
     except OSError as error:
         status = status_without_output(error)
     except Exception as error:
@@ -142,7 +142,7 @@ def status_without_output(error: OSError, status: int = 0) -> int:
     return _failed(f"{error.strerror or error}{of}", status or EXIT_USAGE)
 
 
-def _interrupted(end: BaseException) -> int:
+def interrupted_status(end: BaseException) -> int:
     """Return the exit status that the interrupt carries (128 + the signal), else 130."""
     cause = end.__cause__ if isinstance(end, click.Abort) else end
     status = cause.args[0] if cause is not None and cause.args else EXIT_INTERRUPTED
