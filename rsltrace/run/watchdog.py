@@ -92,9 +92,10 @@ class Watchdog:
                 seen[0], seen[1] = loop.events, loop.now_ns
                 still, self.has_warned = 0, False
             del loop
-            ending += bool(self.signal and still)
-            if ending == _LOOKS_BEFORE_END and still:
-                interrupt_main(self.signal)  # type: ignore[arg-type]  # a number will do
+            if self.signal and still:
+                ending += 1
+                if ending == _LOOKS_BEFORE_END:
+                    interrupt_main(self.signal)  # type: ignore[arg-type]  # a number will do
             since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
             if still >= _LOOKS_BEFORE_NOTE and since_note == _LOOKS_BETWEEN_NOTES:
                 with suppress(Exception):
