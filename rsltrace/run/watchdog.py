@@ -11,9 +11,10 @@ looks instead of reading a clock, so a suspended process or machine causes no al
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
-from _thread import allocate_lock, interrupt_main, start_new_thread
+from _thread import allocate_lock, start_new_thread
 from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -37,6 +38,7 @@ _LOOKS_MAX = 250
 """Longer is not counted. (Python keeps one object of each number up to this forever.)"""
 
 _JOIN_S = 1.0
+_raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
 _NO_PACKAGES: frozenset[str] = frozenset()
 _DEBUGGERS = ("/pdb.py", "/bdb.py", "/pudb/", "/ipdb/", "/IPython/", "/pydevd", "/debugpy/")
 
@@ -95,7 +97,8 @@ class Watchdog:
             if self.signal and still:
                 ending += 1
                 if ending == _LOOKS_BEFORE_END:
-                    interrupt_main(self.signal)  # type: ignore[arg-type]  # a number will do
+                    # Not as a signal: ``timeout`` has sent two, and the third would kill.
+                    _raise_in(ctypes.c_ulong(self._thread), ctypes.py_object(KeyboardInterrupt))
             since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
             if still >= _LOOKS_BEFORE_NOTE and since_note == _LOOKS_BETWEEN_NOTES:
                 with suppress(Exception):
