@@ -2,39 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from inspect import cleandoc
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import DebugError, nearest
 
 if TYPE_CHECKING:
-    from rsltrace.conditions.names import RunNames
-    from rsltrace.debug.checkpoints import StopReport
-    from rsltrace.debug.client import DebugSession
-
-
-class PromptContext(Protocol):
-    """What commands need of the prompt. A command that ends the session sets ``is_over``."""
-
-    session: DebugSession
-    is_over: bool
-
-    def show(self, lines: Iterable[str]) -> None:
-        """Print lines."""
-
-    def stopped(self, stopped: StopReport) -> None:
-        """Print where and why the run has stopped."""
-
-    def read(self, prompt: str) -> str | None:
-        """Return the next line for pdb; None at the end."""
-
-    def node_here(self) -> str | None:
-        """Return the node whose event is about to run, or has just ended."""
-
-    def names(self) -> RunNames:
-        """Return the names there are, as far as they are known."""
+    pass
 
 
 Run = Callable[[Any, str], object]
