@@ -475,7 +475,7 @@ WRITES = {
     "rsltrace/search/explore/small/reduction.py": "unlink",
     "rsltrace/search/perturb.py": "mkdir symlink_to",
     "rsltrace/search/verify.py": "unlink",
-    "rsltrace/trace/recordings/files.py": "open",  # an unpacked file of a bag
+    "rsltrace/trace/recordings/reader.py": "open",  # an unpacked file of a bag
     # Where Python packages are, under the names in wheels of the package index.
     "rsltrace/cli/install_ros.py": "mkdir write_bytes write_text",
     # Nowhere.

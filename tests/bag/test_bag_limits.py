@@ -15,7 +15,6 @@ import zstandard
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.records import CHUNK_BYTES_MAX
-from rsltrace.trace.recordings import files as files_module
 from rsltrace.trace.recordings import metadata as metadata_module
 from rsltrace.trace.recordings import open_bag
 from rsltrace.trace.recordings import reader as reader_module
@@ -40,7 +39,7 @@ def test_a_chunk_larger_than_any_bag_has_is_refused(mcap_bytes: Any, tmp_path: P
 def test_a_compressed_file_that_fills_the_disk_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files_module, "FILE_BYTES_MIN", 1 << 20)
+    monkeypatch.setattr(reader_module, "FILE_BYTES_MIN", 1 << 20)
     path = tmp_path / "a.mcap.zstd"
     path.write_bytes(zstandard.compress(bytes(100 << 20)))
     assert "unpacks to more than" in message(path)

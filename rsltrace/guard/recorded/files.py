@@ -12,7 +12,7 @@ from sys import _getframe
 from typing import Any
 
 from rsltrace.guard import frames
-from rsltrace.guard.file_report_filter import (
+from rsltrace.guard.call_reports import (
     UNREPORTED_MODULES,
     calling_module,
     is_following_links,
