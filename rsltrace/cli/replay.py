@@ -7,7 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import click
 
@@ -15,22 +15,18 @@ from rsltrace.cli.diff import Tolerance, print_diffs
 from rsltrace.cli.options import job_folder_option, json_option, no_pin_option, trust_option
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.output.search_progress import interruptible, progress
-from rsltrace.cli.replay_node import (
-    NodeReplayOptions,
-    replay_from_job,
-    replay_one,
-    tell_of_run,
-)
 from rsltrace.diff.options import DiffOptions
-from rsltrace.errors import ReplayError
+from rsltrace.errors import NodeError, ReplayError
 from rsltrace.guard.pin import unpin
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
-    from rsltrace.replay.edits import Edit
-    from rsltrace.replay.preparation import ReplayPlan
+    from rsltrace.replay.one_node.result import NodeReplayResult
+    from rsltrace.replay.preparation import ReplayOutput, ReplayPlan
     from rsltrace.replay.replaying import ReplayResult
+
+    _Result = TypeVar("_Result", ReplayResult, NodeReplayResult)
 
 _SHOWN_MAX = 12
 
@@ -149,51 +145,87 @@ def replay(
     diverged or the edits changed something; 2 for an error; 130, 143 or 129 if interrupted.
     """
     from rsltrace.replay.edits import check_edits, parse_edit
-    from rsltrace.replay.one_node.ways import is_job
-    from rsltrace.replay.preparation import event_count_to, prepare_replay
+    from rsltrace.replay.one_node.from_bag import replay_from_bag
+    from rsltrace.replay.one_node.replaying import replay_node
+    from rsltrace.replay.one_node.result import as_json as node_json
+    from rsltrace.replay.preparation import (
+        event_count_to,
+        is_job,
+        load_without_bags,
+        prepare_replay,
+    )
+    from rsltrace.replay.replaying import replay_native, replay_prepared
 
     node = ", ".join(nodes)
-    ways = NodeReplayOptions(
-        node=node,
-        bags=bags,
-        until_diverged=until_diverged,
-        everything=everything,
-        options=DiffOptions(ignore=ignore, absolute=absolute) if ignore or absolute else None,
-        output=output,
-        force=force,
-        quiet=quiet,
-        as_json=as_json,
-    )
-    ways.check(until, first, edits)
+    options = DiffOptions(ignore=ignore, absolute=absolute) if ignore or absolute else None
+    of_node = bool(bags or until_diverged or everything or options)
+    _check_options(node, until, first, edits, of_node=of_node)
+    if bags and until_diverged:
+        raise click.UsageError("--until-diverged has no effect with --bag")
     changes = [parse_edit(text) for text in edits]
+    to = _Destination(output, force, silent=quiet or as_json)
+
+    def report_node(result: NodeReplayResult) -> None:
+        if as_json:
+            say(node_json(result))
+        else:
+            _print_node(result, everything=everything)
+
     if bags and is_job(trace):
-        return replay_from_job(trace, ways, no_pin=no_pin)
+        job = load_without_bags(trace)
+        if no_pin or not job.guard.pins:
+            unpin()
+        return _replayed(
+            lambda to: replay_from_bag(job, node, bags, options=options, to=to), to, report_node
+        )
     with prepare_replay(trace, job_folder, bags=not nodes) as plan:
         if no_pin or not plan.job.guard.pins:
             unpin()
         count = None if until is None else event_count_to(plan.trace, until)
         check_edits(changes, plan.trace)
-        begin = 0 if first is None else event_count_to(plan.trace, first) - 1
+        begin = 0 if first is None else max(event_count_to(plan.trace, first) - 1, 0)
         if not as_json:
             for line in code_lines(plan, "replaying", node or None):
                 tell(line)
-        is_native = _is_native(plan, until or first or edits or ways.options or bags)
+        is_native = _is_native(plan, until or first or edits or options or bags)
         agree(plan, trust=trust)
         if nodes and not is_native:
-            return replay_one(plan, ways)
-        result = _replayed(
-            plan, count, max(begin, 0), changes, nodes, output, force=force, quiet=quiet or as_json
-        )
-        reopen_standard_streams()
-        status = result.exit_code
-        try:
+            return _replayed(
+                lambda to: replay_node(
+                    plan, node, bags, until_diverged=until_diverged, options=options, to=to
+                ),
+                to,
+                report_node,
+            )
+
+        def report(result: ReplayResult) -> None:
             if as_json:
                 say(json.dumps(_values(result, plan)))
             else:
                 _print(result)
-        except OSError as error:
-            status = status_without_output(error, status)
-    return status
+
+        if is_native:
+            return _replayed(lambda to: replay_native(plan, nodes, to=to), to, report)
+        return _replayed(
+            lambda to: replay_prepared(plan, until=count, first=begin, to=to, edits=changes),
+            to,
+            report,
+            first=begin,
+        )
+
+
+def _check_options(
+    node: str, until: str | None, first: str | None, edits: Sequence[str], *, of_node: bool
+) -> None:
+    """Raise a usage error for options that have no effect together."""
+    if not node and of_node:
+        raise click.UsageError("--bag, --until-diverged, --all, --ignore and --abs need --node")
+    if node and (until is not None or first is not None):
+        raise click.UsageError(
+            "--from and --until have no effect with --node; use --until-diverged"
+        )
+    if node and edits:
+        raise click.UsageError("--edit needs the whole run: leave out --node")
 
 
 def _is_native(plan: ReplayPlan, options: object) -> bool:
@@ -231,41 +263,32 @@ def agree(plan: ReplayPlan, *, trust: bool) -> None:
         raise ReplayError("nothing was run")
 
 
-def _replayed(
-    plan: ReplayPlan,
-    until: int | None,
-    first: int,
-    edits: Sequence[Edit],
-    nodes: Sequence[str],
-    output: Path | None,
-    *,
-    force: bool,
-    quiet: bool,
-) -> ReplayResult:
-    from rsltrace.replay.replaying import replay_native, replay_prepared
-    from rsltrace.run import RunCallbacks
-    from rsltrace.trace.native import is_native
+class _Destination(NamedTuple):
+    path: Path | None
+    force: bool
+    silent: bool
 
-    with interruptible() as on_interrupt, progress(quiet=quiet, what="replaying") as show:
-        if is_native(plan.trace):
-            return replay_native(
-                plan,
-                nodes,
-                output=output,
-                force=force,
-                echo=not quiet,
-                observer=RunCallbacks(progress=show, interrupt=on_interrupt),
-            )
-        return replay_prepared(
-            plan,
-            until=until,
-            first=first,
-            output=output,
-            force=force,
-            echo=not quiet,
-            observer=RunCallbacks(progress=_from(first, show), interrupt=on_interrupt),
-            edits=edits,
-        )
+
+def _replayed(
+    replay: Callable[[ReplayOutput], _Result],
+    to: _Destination,
+    report: Callable[[_Result], None],
+    *,
+    first: int = 0,
+) -> int:
+    """Replay and report the result; progress is shown from event ``first`` on."""
+    from rsltrace.replay.preparation import ReplayOutput
+    from rsltrace.run import RunCallbacks
+
+    with interruptible() as on_interrupt, progress(quiet=to.silent, what="replaying") as show:
+        observer = RunCallbacks(progress=_from(first, show), interrupt=on_interrupt)
+        result = replay(ReplayOutput(to.path, to.force, not to.silent, observer))
+    reopen_standard_streams()
+    try:
+        report(result)
+    except OSError as error:
+        return status_without_output(error, result.exit_code)
+    return result.exit_code
 
 
 _Show = Callable[[int, int | None, int], None]
@@ -316,8 +339,30 @@ def _near(file: Path) -> Path:
     return file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
 
 
+def _print_node(result: NodeReplayResult, *, everything: bool) -> None:
+    from rsltrace.replay.one_node.result import as_text
+
+    _print_end(result)
+    for line in as_text(result, everything=everything):
+        say(line)
+
+
+def _print_end(result: ReplayResult | NodeReplayResult) -> None:
+    """Print the failure, notes and output file of a replay."""
+    error, diverged = result.error, result.diverged
+    if error is not None:
+        if diverged and isinstance(error, NodeError) and error.traceback_text:
+            tell(error.traceback_text.rstrip())
+        as_recorded = "" if diverged else ", as recorded"
+        tell(f"rsltrace: the run failed{as_recorded}: {error}")
+    for note in result.notes:
+        tell(f"note: {note}")
+    if result.path is not None:
+        tell(f"wrote {result.path}")
+
+
 def _print(result: ReplayResult) -> None:
-    tell_of_run(result.error, result.diverged, result.notes, result.path)
+    _print_end(result)
     if result.edits:
         _print_branch(result)
         return

@@ -105,46 +105,43 @@ def replay_trace(
     """
     from rsltrace.errors import ReplayError
     from rsltrace.replay.edits import parse_edit
-    from rsltrace.replay.preparation import event_count_to, prepare_replay
+    from rsltrace.replay.one_node.from_bag import replay_from_bag
+    from rsltrace.replay.one_node.replaying import replay_node
+    from rsltrace.replay.preparation import (
+        ReplayOutput,
+        event_count_to,
+        is_job,
+        load_without_bags,
+        prepare_replay,
+    )
     from rsltrace.replay.replaying import replay_native, replay_prepared
     from rsltrace.trace.native import is_native
 
-    place = None if output is None else Path(output)
-    if node is not None:
-        if edits:
-            raise ReplayError("edits are for all nodes of a trace: give edits or a node")
-        from rsltrace.replay.one_node.ways import replay_one
-
-        bags = [bag] if isinstance(bag, (str, Path)) else bag or ()
-        return replay_one(
-            Path(trace),
-            node,
-            bags=[Path(one) for one in bags],
-            until_diverged=until_diverged,
-            options=options,
-            output=place,
-            force=force,
-            job=job,
-            job_folder=None if job_folder is None else Path(job_folder),
-            trust=trust,
-            echo=echo,
-        )
-    if bag is not None:
+    if node is not None and edits:
+        raise ReplayError("edits are for all nodes of a trace: give edits or a node")
+    if node is None and bag is not None:
         raise ReplayError("a bag is for one node: say which (node=…)")
+    to = ReplayOutput(None if output is None else Path(output), force, echo)
+    bags = [Path(one) for one in ([bag] if isinstance(bag, (str, Path)) else bag or ())]
+    if node is not None and bags and is_job(Path(trace)):
+        job = job or load_without_bags(Path(trace))
+        return replay_from_bag(job, node, bags, options=options, to=to)
     folder = None if job_folder is None else Path(job_folder)
-    with prepare_replay(trace, folder, job) as plan:
+    with prepare_replay(trace, folder, job, bags=node is None) as plan:
         if plan.distrust and not trust:
             raise ReplayError(f"{trace} would run code, and {plan.distrust}: give trust=True")
+        if node is not None:
+            return replay_node(
+                plan, node, bags, until_diverged=until_diverged, options=options, to=to
+            )
         if is_native(plan.trace):
             if edits or until is not None:
                 raise ReplayError(f"{trace} is of a native run: edit a replay of it (output=…)")
-            return replay_native(plan, output=place, force=force, echo=echo)
+            return replay_native(plan, to=to)
         return replay_prepared(
             plan,
             until=None if until is None else event_count_to(plan.trace, until),
-            output=place,
-            force=force,
-            echo=echo,
+            to=to,
             edits=[parse_edit(edit) for edit in ([edits] if isinstance(edits, str) else edits)],
         )
 

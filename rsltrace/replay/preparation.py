@@ -21,6 +21,7 @@ from rsltrace.replay.code import JobCodeFile, job_code_files, module_file
 from rsltrace.replay.edits import Edit, parse_edit
 from rsltrace.run.inputs import expand_launch_files
 from rsltrace.run.plans.recorded_order import last_ns
+from rsltrace.run.process import RunCallbacks
 from rsltrace.run.provenance import environment
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.model.event import EventKind
@@ -46,6 +47,18 @@ def without_bags(load: Callable[[tuple[str, ...]], Job]) -> Job:
             return load(("bags=[]", "progress=null"))  # who has no bags has no progress
         except JobError:
             raise error from None
+
+
+def is_job(path: Path) -> bool:
+    return path.suffix in (".yaml", ".yml", ".json")
+
+
+def load_without_bags(path: Path) -> Job:
+    """Load a job file without its bags.
+
+    :raises JobError: it cannot be used.
+    """
+    return without_bags(lambda to: load_job(path, overrides=to))
 
 
 def job_in_trace(trace: Trace, folder: Path, *, bags: bool = True) -> Job:
@@ -225,7 +238,7 @@ def _own_job(file: Path, *, bags: bool) -> Job | None:
         spec = json.dumps({"file": file.name, "arguments": {}})
         job = job_from_text("{}", str(file), file.parent, overrides=[f"launch.+={spec}"])
     elif file.suffix in (".yaml", ".yml", ".json"):
-        job = load_job(file) if bags else without_bags(lambda to: load_job(file, overrides=to))
+        job = load_job(file) if bags else load_without_bags(file)
     else:
         return None
     for launch in job.launch:
@@ -373,14 +386,33 @@ def _notes(trace: Trace) -> Iterator[str]:
         )
 
 
-@contextmanager
-def place_for(output: Path | None) -> Iterator[Path]:
-    """Yield the path for the replay's trace: ``output``, or a temporary file."""
-    if output is not None:
-        yield output
-        return
-    with tempfile.TemporaryDirectory(prefix="rsltrace-replay-") as folder:
-        yield Path(folder, "replay.mcap")
+@dataclass(frozen=True, slots=True)
+class ReplayOutput:
+    """Where a replay's own trace goes (``path``; None: it is not kept), and who watches the run.
+
+    ``force`` replaces a trace that is there; ``echo`` prints the nodes' log records.
+    """
+
+    path: Path | None = None
+    force: bool = False
+    echo: bool = False
+    observer: RunCallbacks | None = None
+
+    @contextmanager
+    def place(self) -> Iterator[Path]:
+        """Yield the path of the trace, else that of a temporary file."""
+        if self.path is not None:
+            yield self.path
+            return
+        with tempfile.TemporaryDirectory(prefix="rsltrace-replay-") as folder:
+            yield Path(folder, "replay.mcap")
+
+    def kept(self, place: Path) -> Path | None:
+        """Return where the trace is after the run, None if it is not kept."""
+        return None if self.path is None else place
+
+
+NOT_KEPT = ReplayOutput()
 
 
 def event_count_to(trace: Trace, position: Position) -> int:

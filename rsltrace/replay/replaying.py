@@ -15,9 +15,9 @@ from rsltrace.errors import ReplayError, RunError
 from rsltrace.replay.editing import EditObserver
 from rsltrace.replay.edits import Edit, check_edits, edits_metadata
 from rsltrace.replay.one_node.from_bag import node_topics
-from rsltrace.replay.preparation import ReplayPlan, place_for
+from rsltrace.replay.preparation import NOT_KEPT, ReplayOutput, ReplayPlan
 from rsltrace.replay.verification import EventVerification, interruption
-from rsltrace.run import RunCallbacks, RunResult
+from rsltrace.run import RunResult
 from rsltrace.run.process import preserved_process
 from rsltrace.run.session import RunSession
 from rsltrace.trace.chain import digest_text
@@ -109,10 +109,7 @@ def replay_native(
     plan: ReplayPlan,
     nodes: Sequence[str] = (),
     *,
-    output: Path | None = None,
-    force: bool = False,
-    echo: bool = False,
-    observer: RunCallbacks | None = None,
+    to: ReplayOutput = NOT_KEPT,
 ) -> ReplayResult:
     """Simulate what a native run did, in its order; with ``nodes``, only the entries of the job
     that make these, and the others are played from the trace.
@@ -129,8 +126,8 @@ def replay_native(
         publishers = [e for e in plan.trace.entities.values() if e.kind is EntityKind.PUBLISHER]
         others = {e.name for e in publishers if plan.trace.node_of(e).name not in own}
         topics = {name for one in found for name in one.published} - others - {*NODE_TOPICS} or {""}
-    with place_for(output) as path, preserved_process():
-        with RunSession(job, path, force=force, echo=echo, observer=observer) as session:
+    with to.place() as path, preserved_process():
+        with RunSession(job, path, force=to.force, echo=to.echo, observer=to.observer) as session:
             session.begin()
             if not session.ended:
                 session.go_on()
@@ -138,7 +135,7 @@ def replay_native(
         place = run.path or path
         with Trace.open(place) as again:
             compared = diff_traces(plan.trace, again, DiffOptions(topics=tuple(sorted(topics))))
-    kept = None if output is None else place
+    kept = to.kept(place)
     native = compared.native
     assert native is not None, "one of them is native"
     if kept is None:  # there is nothing to compare again
@@ -177,16 +174,13 @@ def replay_prepared(
     *,
     until: int | None = None,
     first: int = 0,
-    output: Path | None = None,
-    force: bool = False,
-    echo: bool = False,
-    observer: RunCallbacks | None = None,
+    to: ReplayOutput = NOT_KEPT,
     edits: Sequence[Edit] = (),
 ) -> ReplayResult:
     """Run a job as its trace says, ``until`` so many events are verified (None: to the end).
 
-    This runs user code: see ``trust``. ``echo`` prints what the nodes log from event number
-    ``first`` on. With ``edits`` it is verified up to the first of them, and then goes on as a
+    This runs user code: see ``trust``. What the nodes log is printed from event number ``first``
+    on. With ``edits`` it is verified up to the first of them, and then goes on as a
     branch of its own, which is compared with the trace.
 
     :raises ReplayError: it is the trace of one node alone.
@@ -201,21 +195,21 @@ def replay_prepared(
         )
 
     def on_first(session: RunSession) -> None:
-        session.world.echo_logs(echo)
+        session.world.echo_logs(to.echo)
 
     verification = EventVerification(plan.trace, until, first=first, on_first=on_first)
     editing = EditObserver(
         (*plan.edits, *edits), known=len(plan.edits), on_new=verification.branch_off
     )
     check_edits(edits, plan.trace)
-    with place_for(output) as path:
-        run = _run(plan, verification, editing, path, force=force, observer=observer)
+    with to.place() as path:
+        run = _run(plan, verification, editing, path, to)
         place = run.path or path
-        kept = None if output is None else place
+        kept = to.kept(place)
         if verification.has_branched_off:
             return _branch(plan, verification, editing, run, place, kept)
         compared = _diverged(plan.trace, verification)
-        difference = _difference(plan.trace, place, kept=output is not None) if compared else None
+        difference = _difference(plan.trace, place, kept=kept is not None) if compared else None
     return _result(plan, verification, run, difference, kept)
 
 
@@ -224,9 +218,7 @@ def _run(
     verification: EventVerification,
     editing: EditObserver,
     path: Path,
-    *,
-    force: bool,
-    observer: RunCallbacks | None,
+    to: ReplayOutput,
 ) -> RunResult:
     recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
     edits = editing.unmade
@@ -234,7 +226,12 @@ def _run(
     with (
         preserved_process(),
         RunSession(
-            plan.job, path, force=force, observer=observer, replay=recorded, metadata=metadata
+            plan.job,
+            path,
+            force=to.force,
+            observer=to.observer,
+            replay=recorded,
+            metadata=metadata,
         ) as session,
     ):
         verification.attach(session)

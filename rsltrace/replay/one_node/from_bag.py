@@ -22,9 +22,9 @@ from rsltrace.replay.one_node.output_comparison import (
     outputs_of_node,
 )
 from rsltrace.replay.one_node.result import NodeReplayResult
-from rsltrace.replay.preparation import place_for
+from rsltrace.replay.preparation import NOT_KEPT, ReplayOutput
 from rsltrace.replay.verification import interruption
-from rsltrace.run import RunCallbacks, run
+from rsltrace.run import run
 from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays
 from rsltrace.run.process import preserved_process
 from rsltrace.run.session import RunSession
@@ -122,10 +122,7 @@ def replay_from_bag(
     bags: Sequence[Path],
     *,
     options: DiffOptions | None = None,
-    output: Path | None = None,
-    force: bool = False,
-    echo: bool = False,
-    observer: RunCallbacks | None = None,
+    to: ReplayOutput = NOT_KEPT,
 ) -> NodeReplayResult:
     """Run one node of a job with inputs from bags; compare its outputs.
 
@@ -137,14 +134,9 @@ def replay_from_bag(
     ends = node_topics(alone, node)
     specs = tuple(_specs(bags, ends))
     nodes = (job.nodes[ends.entry],)
-    with place_for(output) as path:
-        done = run(
-            alone.model_copy(update={"nodes": nodes, "bags": specs}),
-            path,
-            force=force,
-            echo=echo,
-            observer=observer,
-        )
+    job = alone.model_copy(update={"nodes": nodes, "bags": specs})
+    with to.place() as path:
+        done = run(job, path, force=to.force, echo=to.echo, observer=to.observer)
         if done.error is not None:
             raise done.error
         place = done.path or path
@@ -163,7 +155,7 @@ def replay_from_bag(
         start_ns=done.start_ns,
         end_ns=done.end_ns,
         ended=done.stop_reason,
-        path=None if output is None else place,
+        path=to.kept(place),
         interrupted=interruption(done),
         notes=tuple(dict.fromkeys([*done.notes, *_notes(ends, there)])),
     )

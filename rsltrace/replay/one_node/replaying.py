@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
+from rsltrace.replay.one_node.from_bag import replay_from_bag
 from rsltrace.replay.one_node.output_comparison import (
     NodeOutputs,
     OutputWatch,
@@ -21,9 +22,9 @@ from rsltrace.replay.one_node.output_comparison import (
 )
 from rsltrace.replay.one_node.result import Column, NodeReplayResult, RecordingColumns
 from rsltrace.replay.one_node.script import RecordedScript, ReplayedEntry, check_payloads
-from rsltrace.replay.preparation import ReplayPlan, place_for
+from rsltrace.replay.preparation import NOT_KEPT, ReplayOutput, ReplayPlan
 from rsltrace.replay.verification import interruption
-from rsltrace.run import RunCallbacks, RunResult
+from rsltrace.run import RunResult
 from rsltrace.run.plans.entries import add_job_location, hook_entries, node_entries
 from rsltrace.run.plans.recorded_order import definition_of
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, switches_at_lines
@@ -123,15 +124,12 @@ class NodeReplaySession(RunSession):
         plan: ReplayPlan,
         columns: RecordingColumns,
         unit: ReplayedEntry,
-        output: Path,
-        *,
-        force: bool = False,
-        echo: bool = False,
-        observer: RunCallbacks | None = None,
+        path: Path,
+        to: ReplayOutput,
     ) -> None:
         recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
         super().__init__(
-            plan.job, output, force=force, echo=echo, observer=observer, replay=recorded
+            plan.job, path, force=to.force, echo=to.echo, observer=to.observer, replay=recorded
         )
         self._columns = columns
         self._unit = unit
@@ -319,19 +317,20 @@ CHANGED = Stop("the first output that is not as recorded", 1)
 def replay_node(
     plan: ReplayPlan,
     node: str,
+    bags: Sequence[Path] = (),
     *,
     until_diverged: bool = False,
     options: DiffOptions | None = None,
-    output: Path | None = None,
-    force: bool = False,
-    echo: bool = False,
-    observer: RunCallbacks | None = None,
+    to: ReplayOutput = NOT_KEPT,
 ) -> NodeReplayResult:
-    """Run one node of a trace alone with its recorded inputs; compare its outputs.
+    """Run one node of a trace alone with its recorded inputs, or those of bags; compare its
+    outputs.
 
     :raises ReplayError: there is no such node, or the trace lacks its inputs.
     :raises JobError, SetupError, OutputError: the run cannot start or be written.
     """
+    if bags:
+        return replay_from_bag(plan.job, node, bags, options=options, to=to)
     trace = plan.trace
     if plan.edits:
         raise ReplayError(f"{trace.name} is a branch with edits, which replays as a whole only")
@@ -344,10 +343,8 @@ def replay_node(
     unit = ReplayedEntry(columns, plan.job, node, entries_of(trace, columns))
     check_payloads(columns, unit)
     recorded = outputs_of_node(trace, unit.node.name)
-    with place_for(output) as path:
-        session = NodeReplaySession(
-            plan, columns, unit, path, force=force, echo=echo, observer=observer
-        )
+    with to.place() as path:
+        session = NodeReplaySession(plan, columns, unit, path, to)
         watch = (
             OutputWatch(recorded, unit.node.name, CHANGED)
             if until_diverged and not options
@@ -380,7 +377,7 @@ def replay_node(
         start_ns=run.start_ns,
         end_ns=run.end_ns,
         ended=run.stop_reason,
-        path=None if output is None else place,
+        path=to.kept(place),
         error=run.error,
         interrupted=interruption(run),
         notes=tuple(dict.fromkeys([*plan.notes, *_notes(unit, run, bool(found))])),
