@@ -463,7 +463,7 @@ WRITES = {
     "rsltrace/adapters/workspace/installs.py": "mkdir symlink_to touch",
     "rsltrace/adapters/workspace/interfaces.py": "mkdir touch write_text",
     "rsltrace/cli/bisect.py": "copyfile mkdir",
-    "rsltrace/native/processes/programs.py": "open unlink",
+    "rsltrace/native/processes/record_file.py": "open unlink",
     "rsltrace/native/processes/run.py": "mkdir",
     "rsltrace/replay/replaying.py": "unlink",
     "rsltrace/search/bisect/repository.py": "mkdir symlink_to",  # names in a commit of git

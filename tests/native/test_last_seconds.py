@@ -24,8 +24,8 @@ from rsltrace.job.parts.record import LastSpec
 from rsltrace.native import last_seconds
 from rsltrace.native.last_seconds import LastSeconds, LiveChecks
 from rsltrace.native.observed_entities import ObservedEntity
-from rsltrace.native.processes import programs
-from rsltrace.native.processes.programs import RecordFile, RecordKind
+from rsltrace.native.processes import record_file
+from rsltrace.native.processes.record_file import RecordFile, RecordKind
 from rsltrace.native.span_recorder import CallbackError, CallbackSpan, EmittedLog, SentMessage
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.contents import check_contents
@@ -73,27 +73,27 @@ class Writing:
 
     def __init__(self, path: Path) -> None:
         path.write_bytes(
-            struct.pack("=2Q", programs._MAGIC, CAPACITY).ljust(4096, b"\0")
-            + bytes(CAPACITY + programs._MADE_SIZE)
+            struct.pack("=2Q", record_file._MAGIC, CAPACITY).ljust(4096, b"\0")
+            + bytes(CAPACITY + record_file._MADE_SIZE)
         )
         self.file = RecordFile(path)
         self.part = -1
 
     def reserve(self, size: int) -> None:
-        self.file._head[programs._RESERVED] = self.file._head[programs._WRITTEN] + size
+        self.file._head[record_file._RESERVED] = self.file._head[record_file._WRITTEN] + size
 
     def add(self, number: int, size: int) -> None:
         file = self.file
-        at = file._head[programs._WRITTEN]
+        at = file._head[record_file._WRITTEN]
         self.reserve(size)
-        part = at // (CAPACITY // programs._PARTS) % programs._PARTS
+        part = at // (CAPACITY // record_file._PARTS) % record_file._PARTS
         if part != self.part:
-            file._head[programs._STARTS + part] = at
+            file._head[record_file._STARTS + part] = at
         self.part = part
         record = struct.pack("=IIqqII", size, RecordKind.WAIT, number, 0, 7, 0).ljust(size, b"x")
         for place, byte in enumerate(record, start=at):
             file._map[4096 + place % CAPACITY] = byte
-        file._head[programs._WRITTEN] = at + size
+        file._head[record_file._WRITTEN] = at + size
 
     def numbers(self) -> list[int]:
         _, left = self.file.last()

@@ -12,8 +12,9 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.adapters.processes.wire import RecordReader, packed_qos, packed_text
 from rsltrace.adapters.rclpy.handles.logs import QOS_ROSOUT
-from rsltrace.native.processes import programs
-from rsltrace.native.processes.programs import ProgramSpans, Record, RecordFile, RecordKind
+from rsltrace.native.processes import record_file
+from rsltrace.native.processes.programs import ProgramSpans
+from rsltrace.native.processes.record_file import Record, RecordFile, RecordKind
 from rsltrace.native.span_recorder import CallbackSpan, SentMessage
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import EventFlag, EventKind
@@ -138,7 +139,7 @@ def test_nothing_after_lost_records_is_of_a_callback_before_them() -> None:
 def test_a_file_is_read_around_its_end_and_without_what_is_being_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs, "now_ns", lambda: 1000)
+    monkeypatch.setattr(record_file, "now_ns", lambda: 1000)
     path = tmp_path / "7.1"
     path.write_bytes(bytes(4096 + CAPACITY))
     with pytest.raises(ValueError, match="nothing"):
@@ -150,7 +151,7 @@ def test_a_file_is_read_around_its_end_and_without_what_is_being_written(
     for place, byte in enumerate(record, start=CAPACITY - 20):
         ring[place % CAPACITY] = byte
     start = 10 * CAPACITY - 20
-    head = (programs._MAGIC, CAPACITY, start + len(record), start, 1, 3, 0)
+    head = (record_file._MAGIC, CAPACITY, start + len(record), start, 1, 3, 0)
     path.write_bytes(struct.pack("=7Q", *head).ljust(4096, b"\0") + ring)
     file = RecordFile(path)
     assert not path.exists()

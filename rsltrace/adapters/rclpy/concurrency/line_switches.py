@@ -37,12 +37,8 @@ from rsltrace.trace.model.event import CodeLine, RandomDecision, encode_decision
 _OURS = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(__file__)))) + os.sep
 _CALLS_BACK = os.path.join(_OURS, "simulation", "middleware", "events", "dispatcher.py")
 _ADAPTER = os.path.join(_OURS, "adapters", "rclpy", "")
-_IN_BETWEEN = (
-    *(
-        os.path.join(_ADAPTER, name, "")
-        for name in ("handles", "executors", "actions", "concurrency")
-    ),
-    os.path.join(_OURS, "run", "plans", "main_programs.py"),
+_IN_BETWEEN = tuple(
+    os.path.join(_ADAPTER, name, "") for name in ("handles", "executors", "concurrency")
 )
 """Folders of frames that may be between a callback and its caller."""
 _CALLBACK_GROUPS = os.path.join(_ADAPTER, "concurrency", "callback_groups.py")
