@@ -9,14 +9,11 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from types import CodeType, FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-from rsltrace.debug.current_event import code_of
+from rsltrace.debug.current_event import CurrentEventView, code_of
 from rsltrace.errors import DebugError
-from rsltrace.line_protocol import Message
-
-if TYPE_CHECKING:
-    from rsltrace.debug.engine import Engine
+from rsltrace.line_protocol import Lines, Message
 
 # Debugpy's threads, locks and sleeps have to be real ones, even on the stack of a stopped callback.
 # ``Outside`` is the context in which they are not part of the run.
@@ -123,7 +120,20 @@ Calls = Callable[..., None]
 """Takes a callback and its arguments."""
 
 
-def make_debugger(copy: Engine, request: Message) -> Calls:
+class DebuggedCopy(Protocol):
+    """A copy of a simulation, made for a debugger."""
+
+    lines: Lines
+    view: CurrentEventView
+
+    def outside(self) -> AbstractContextManager[None]:
+        """Do what is no part of the run."""
+
+    def end_apart(self, **answer: Any) -> None:
+        """End the copy with an answer."""
+
+
+def make_debugger(copy: DebuggedCopy, request: Message) -> Calls:
     """Return what calls the next callbacks under the debugger that a request names.
 
     :raises DebugError: there is none such here.
@@ -133,7 +143,7 @@ def make_debugger(copy: Engine, request: Message) -> Calls:
     return _under_debugpy(copy, int(request["port"]))
 
 
-def _under_pdb(copy: Engine, address: str) -> Calls:
+def _under_pdb(copy: DebuggedCopy, address: str) -> Calls:
     from rsltrace.debug.callback_pdb import call_under_pdb
 
     def calls(callback: Callable[..., Any], args: tuple[Any, ...]) -> None:
@@ -148,7 +158,7 @@ def _under_pdb(copy: Engine, address: str) -> Calls:
     return calls
 
 
-def _under_debugpy(copy: Engine, port: int) -> Calls:
+def _under_debugpy(copy: DebuggedCopy, port: int) -> Calls:
     with copy.outside():
         _end_when_told(copy)
         editor = DebugpyServer(port, copy.outside)
@@ -170,7 +180,7 @@ def _under_debugpy(copy: Engine, port: int) -> Calls:
     return calls
 
 
-def _end_when_told(copy: Engine) -> None:
+def _end_when_told(copy: DebuggedCopy) -> None:
     """End the copy when its client asks for it or disconnects."""
 
     def wait() -> None:

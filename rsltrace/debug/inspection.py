@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.adapters.processes.process import Process
 from rsltrace.conditions.evaluation import (
@@ -29,14 +29,15 @@ from rsltrace.conditions.expressions import (
 )
 from rsltrace.conditions.names import RunNames
 from rsltrace.conditions.view import EventView
-from rsltrace.debug.current_event import source
+from rsltrace.debug.current_event import CurrentEventView, source
 from rsltrace.errors import ConditionError, DebugError, did_you_mean, near_or_all
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.overview import graph_overview
 from rsltrace.trace.words.entities import nodes_called
 
 if TYPE_CHECKING:
-    from rsltrace.debug.engine import Engine
+    from rsltrace.debug.event_history import EventLedger
+    from rsltrace.run.session import RunSession
 
 # ``print EXPRESSION`` and ``DebugSession.evaluate`` take Python from the user at the prompt, in a
 # copy of a run whose code they trust: it may call methods of nodes. Text from files is never
@@ -150,7 +151,18 @@ _short.maxlist = _short.maxtuple = _short.maxset = _short.maxdict = _short.maxde
 _short.maxlevel = 6
 
 
-def live_node(run: Engine, name: str) -> Any:
+class StoppedRun(Protocol):
+    """A run that is stopped between two events."""
+
+    view: CurrentEventView
+    session: RunSession
+    ledger: EventLedger
+
+    def names(self) -> RunNames:
+        """Return the names in the run."""
+
+
+def live_node(run: StoppedRun, name: str) -> Any:
     """Return a node by its full name, or its last part.
 
     :raises DebugError: none or several match, or it does not exist now.
@@ -162,7 +174,7 @@ def live_node(run: Engine, name: str) -> Any:
     return node
 
 
-def full_name(run: Engine, name: str) -> str:
+def full_name(run: StoppedRun, name: str) -> str:
     """Return the full name of a node given by any unique part.
 
     :raises DebugError: none or several match.
@@ -176,7 +188,7 @@ def full_name(run: Engine, name: str) -> str:
     raise DebugError(f"no node is called {name!r}{near_or_all(name, nodes)}")
 
 
-def evaluate(run: Engine, expression: str, node: str | None) -> dict[str, Any]:
+def evaluate(run: StoppedRun, expression: str, node: str | None) -> dict[str, Any]:
     """Return the value of a Python expression as JSON, and its ``repr``.
 
     :raises ConditionError: it is not an expression, or uses an unknown name.
@@ -228,7 +240,7 @@ def json_value(value: Any) -> Any:
     raise TypeError(f"{type(value).__qualname__} is not JSON")
 
 
-def attributes(run: Engine, name: str) -> dict[str, str]:
+def attributes(run: StoppedRun, name: str) -> dict[str, str]:
     """Return a node's own attributes and parameters with their ``repr``.
 
     An object without a ``repr`` of its own is listed by its attributes: ``_ekf.P``.
@@ -260,14 +272,14 @@ def _plain_parts(value: object) -> Mapping[str, Any]:
     return {**found, **getattr(value, "__dict__", {})}
 
 
-def nodes(run: Engine) -> list[dict[str, Any]]:
+def nodes(run: StoppedRun) -> list[dict[str, Any]]:
     return [
         {"name": name, "class": f"{type(node).__module__}.{type(node).__qualname__}"}
         for name, node in run.view.nodes().items()
     ]
 
 
-def queues(run: Engine) -> list[dict[str, Any]]:
+def queues(run: StoppedRun) -> list[dict[str, Any]]:
     graph = run.session.world.domain.graph
     found = []
     for node in graph.nodes:
@@ -285,7 +297,7 @@ def queues(run: Engine) -> list[dict[str, Any]]:
     return found
 
 
-def timers(run: Engine) -> list[dict[str, Any]]:
+def timers(run: StoppedRun) -> list[dict[str, Any]]:
     """Return the timers, the next due first, cancelled ones last."""
     found = []
     for node in run.session.world.domain.graph.nodes:
@@ -307,19 +319,19 @@ def _timers_of(node: Any) -> list[Any]:
     return list(node.timers) if wrapper is None else [one.handle for one in wrapper.timers]
 
 
-def stacks(run: Engine) -> list[str]:
+def stacks(run: StoppedRun) -> list[str]:
     runtime = run.session.world.runtime
     waits = [one.waits_for() for one in runtime.coroutines.suspended]
     return waits + [blocked.waits_for() for blocked in runtime.runners.blocked]
 
 
-def graph(run: Engine) -> dict[str, Any]:
+def graph(run: StoppedRun) -> dict[str, Any]:
     values = asdict(graph_overview(run.session.world.domain.graph, ()))
     del values["waiting"]
     return values
 
 
-def processes(run: Engine) -> list[dict[str, Any]]:
+def processes(run: StoppedRun) -> list[dict[str, Any]]:
     """Return the programs that take part: their numbers, nodes and the lines of their callbacks."""
     found: dict[int, dict[str, Any]] = {}
     for node in run.session.world.domain.graph.nodes:
@@ -332,7 +344,7 @@ def processes(run: Engine) -> list[dict[str, Any]]:
     return list(found.values())
 
 
-def message(run: Engine) -> dict[str, Any] | None:
+def message(run: StoppedRun) -> dict[str, Any] | None:
     """Return the input message of the current (or next) callback."""
     received = run.view.received()
     if received is None:
@@ -345,11 +357,7 @@ def message(run: Engine) -> dict[str, Any] | None:
     }
 
 
-def _source(run: Engine) -> dict[str, Any] | None:
-    return source(run.view, run.ledger)
-
-
-INSPECTED: dict[str, Callable[[Engine], Any]] = {
+INSPECTED: dict[str, Callable[[StoppedRun], Any]] = {
     "nodes": nodes,
     "queues": queues,
     "timers": timers,
@@ -357,11 +365,11 @@ INSPECTED: dict[str, Callable[[Engine], Any]] = {
     "graph": graph,
     "message": message,
     "processes": processes,
-    "source": _source,
+    "source": lambda run: source(run.view, run.ledger),
 }
 
 
-def inspect_run(run: Engine, what: str) -> Any:
+def inspect_run(run: StoppedRun, what: str) -> Any:
     if what not in INSPECTED:
         there = ", ".join(INSPECTED)
         raise DebugError(f"nothing is called {what!r}; {did_you_mean(what, INSPECTED, there)}")

@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
@@ -30,9 +30,6 @@ from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.native import CUT_AFTER_NS
-
-if TYPE_CHECKING:
-    from rsltrace.native.processes.run import MultiProcessRun
 
 _SETTLED_NS = 200_000_000
 """How long after its reason a file is written: it has what came of it, and one message that several
@@ -177,6 +174,20 @@ class LiveChecks:
                 one.found.clear()
 
 
+class Programs(Protocol):
+    """What keeps its last seconds itself, in memory of its processes."""
+
+    def look_at_programs(self, since_ns: int) -> Iterable[tuple[int, str]]:
+        """Look what has happened; return times and reasons to write a file. What ended before
+        ``since_ns`` is forgotten."""
+
+    def checked(self) -> list[CallbackSpan]:
+        """Return what is new of what checks are about."""
+
+    def last_of_programs(self, since_ns: int) -> tuple[list[CallbackSpan], list[str]]:
+        """Return the spans that are kept, and in words what is missing from then on."""
+
+
 class LastSeconds:
     """The last spans of a source and of programs.
 
@@ -187,7 +198,7 @@ class LastSeconds:
         self,
         spec: LastSpec,
         source: SpanSource,
-        programs: MultiProcessRun | None,
+        programs: Programs | None,
         keeps_payload: Callable[[str], bool],
         keep: Callable[[str], None],
     ) -> None:

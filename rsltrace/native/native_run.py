@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rsltrace.errors import JobError, NodeError, RsltraceError, RunError, SetupError
 from rsltrace.job import Job, locate
 from rsltrace.native import support
-from rsltrace.native.last_seconds import LastSeconds, LiveChecks
+from rsltrace.native.last_seconds import LastSeconds, LiveChecks, Programs
 from rsltrace.native.priorities import order, real_time_class
 from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
@@ -38,9 +38,6 @@ from rsltrace.trace.mcap.sink import unfinished_path
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
-
-if TYPE_CHECKING:
-    from rsltrace.native.processes.run import MultiProcessRun
 
 LOOK_EVERY_S = 0.01
 ENDS_WITHIN_S = 5.0
@@ -152,7 +149,7 @@ class NativeRun:
         spans: SpanSource,
         described: Mapping[str, str],
         sources: Mapping[str, Path] | None = None,
-        programs: MultiProcessRun | None = None,
+        programs: Programs | None = None,
         *,
         force: bool,
     ) -> None:
@@ -198,7 +195,7 @@ class NativeRun:
     # -- only the last seconds ------------------------------------------------------------------
 
     def _keep_last(
-        self, stack: ExitStack, spans: SpanSource, programs: MultiProcessRun | None
+        self, stack: ExitStack, spans: SpanSource, programs: Programs | None
     ) -> LastSeconds:
         spec = self.job.record.last
         assert spec is not None

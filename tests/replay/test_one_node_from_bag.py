@@ -29,7 +29,6 @@ def robot(recorded: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setattr("rsltrace.cli.replay.unpin", lambda: None)
-    monkeypatch.setattr("rsltrace.cli.replay_node.unpin", lambda: None)
     export_bag(recorded(), tmp_path / "bag", topics=["/speed", "/smooth"])
     return tmp_path
 

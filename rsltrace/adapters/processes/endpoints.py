@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from rsltrace.adapters.processes.wire import WakeReason, changed_item, gid_of, packed_item
 from rsltrace.errors import RunError
@@ -27,9 +27,6 @@ from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.event import NO_EVENT, OutputKind
 
-if TYPE_CHECKING:
-    from rsltrace.adapters.processes.process import Process
-
 _NO_GID = bytes(16)
 
 
@@ -49,6 +46,32 @@ class WaitableEntity(Protocol):
         """Name it for people."""
 
 
+class HostProcess(Protocol):
+    """The process that endpoints and timers are in, as they see it."""
+
+    name: str
+    dispatcher: Dispatcher
+    has_begun: bool
+
+    def wants(self, thing: WaitableEntity) -> bool:
+        """Return whether one of its threads waits for a thing now."""
+
+    def hold(self, thing: WaitableEntity) -> None:
+        """Keep what is ready until the process waits for it."""
+
+    def go_on_with(self, number: int, ready: WakeReason, item: bytes) -> None:
+        """Let the thread that waits for a thing go on, until the process waits again."""
+
+    def begin_with(self, number: int, ready: WakeReason, item: bytes) -> None:
+        """Let that thread go on already; ``go_on_with`` follows."""
+
+    def was_no_callback(self) -> None:
+        """Say that the event under way is no callback's."""
+
+    def own(self, timer: ProcessTimer) -> None:
+        """Give a timer whose callback has run to a node."""
+
+
 class RosoutPublisher(Publisher):
     """A publisher of /rosout: what it sends are log records."""
 
@@ -61,7 +84,7 @@ class RosoutPublisher(Publisher):
 class QueueEndpoint(Receiver):
     """An endpoint with a queue of arrivals. ``number`` is what the process calls it."""
 
-    process: Process
+    process: HostProcess
     number: int
     event_kind: int
     _begun: tuple[Any, bytes] | None = None
@@ -155,7 +178,7 @@ class ProcessSubscription(_CallbackEndpoint, Subscription):
 
     def __init__(
         self,
-        process: Process,
+        process: HostProcess,
         number: int,
         node: Participant,
         topic: str,
@@ -188,7 +211,7 @@ class ProcessService(_CallbackEndpoint, Service):
 
     def __init__(
         self,
-        process: Process,
+        process: HostProcess,
         number: int,
         transport: Transport,
         node: Participant,
@@ -224,7 +247,7 @@ class ProcessClient(QueueEndpoint, Client):
 
     def __init__(
         self,
-        process: Process,
+        process: HostProcess,
         number: int,
         transport: Transport,
         node: Participant,
@@ -259,7 +282,7 @@ class ProcessTimer(Timer):
     begins_active = False
 
     def __init__(
-        self, dispatcher: Dispatcher, process: Process, number: int, period_ns: int
+        self, dispatcher: Dispatcher, process: HostProcess, number: int, period_ns: int
     ) -> None:
         super().__init__(dispatcher, None, period_ns)
         self.process = process

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from rsltrace.adapters.processes import graph_answers
 from rsltrace.adapters.processes.child import Batch, ProcessEnd, ProcessHandle
@@ -15,6 +15,7 @@ from rsltrace.adapters.processes.endpoints import (
     WaitableEntity,
 )
 from rsltrace.adapters.processes.process_entities import (
+    EntityFactory,
     GraphChange,
     ProcessEntities,
     WakingTimer,
@@ -42,9 +43,6 @@ from rsltrace.trace.model.event import EventFlag, EventKind
 from rsltrace.trace.model.finding import NondeterminismSource, unseen_text
 from rsltrace.trace.model.texts import format_seconds
 
-if TYPE_CHECKING:
-    from rsltrace.adapters.processes.adapter import ProcessAdapter
-
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 _GRACE_S = 5.0
@@ -66,6 +64,24 @@ _WROTE = "wrote something of its own to"
 Question = Callable[[RecordReader], bytes]
 
 
+class ProcessRun(EntityFactory, Protocol):
+    """What a process finds in its run."""
+
+    log: Callable[[int, str, str], None]
+    follows_clock: Callable[[str], bool]
+    note_answer: Callable[[NondeterminismSource, str, str, str, str], None]
+    clock: Callable[[str | None, bool], tuple[int, bool]] | None
+
+    def seed_of(self, key: str) -> int:
+        """Return the number from which a process draws what others take for entropy."""
+
+    def has_ended(self, process: Process) -> None:
+        """Take note that a process has ended, in the event under way."""
+
+    def begin_others(self, running: Process) -> None:
+        """Let others begin with what comes next for them while one computes."""
+
+
 class Process:
     """An executable that runs beside rsltrace; in the trace, a main.
 
@@ -74,7 +90,7 @@ class Process:
 
     def __init__(
         self,
-        adapter: ProcessAdapter,
+        adapter: ProcessRun,
         name: str,
         key: str,
         *,

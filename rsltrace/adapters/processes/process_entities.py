@@ -7,9 +7,10 @@ import struct
 from collections.abc import Callable
 from dataclasses import astuple
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rsltrace.adapters.processes.endpoints import (
+    HostProcess,
     ProcessClient,
     ProcessService,
     ProcessSubscription,
@@ -19,16 +20,16 @@ from rsltrace.adapters.processes.endpoints import (
 from rsltrace.adapters.processes.source_lines import callback_place, stack_text
 from rsltrace.adapters.processes.wire import RecordKind, RecordReader, WakeReason, packed_item
 from rsltrace.simulation.loop.timer_queue import TimerState
+from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.entity import DomainEntity, Runnable
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.events.event import ExceptionHandler
+from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant, QosEvent, full_name
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.event import NO_EVENT, CodeLine, EventKind
 from rsltrace.trace.model.operation import PARAMETER_EVENTS
-
-if TYPE_CHECKING:
-    from rsltrace.adapters.processes.adapter import ProcessAdapter
-    from rsltrace.adapters.processes.process import Process
 
 # What lets a process go on besides messages and timers: the end of a wait, and the graph.
 
@@ -36,10 +37,28 @@ _RESUME = int(EventKind.RESUME)
 _OF_NODES = (TOPIC_ROSOUT, PARAMETER_EVENTS)
 
 
+class GraphWaiter(Protocol):
+    """A process, as what wakes it sees it."""
+
+    name: str
+    entity_id: int
+    dispatcher: Dispatcher
+
+    @property
+    def waits_for_graph(self) -> bool:
+        """Whether one of its threads waits for a change of the graph now."""
+
+    def wake(self, thread: int) -> None:
+        """Let a thread go on whose time has come."""
+
+    def see_graph(self) -> None:
+        """Let those threads go on that wait for a change of the graph."""
+
+
 class WakingTimer:
     """Wakes a thread of a process when the time is over for which it sleeps or waits."""
 
-    def __init__(self, process: Process, thread: int) -> None:
+    def __init__(self, process: GraphWaiter, thread: int) -> None:
         self._process = process
         self._thread = thread
         dispatcher = process.dispatcher
@@ -86,7 +105,7 @@ class WakingTimer:
 class GraphChange:
     """Wakes a process that waits for the graph to change; what changes before it waits, counts."""
 
-    def __init__(self, process: Process) -> None:
+    def __init__(self, process: GraphWaiter) -> None:
         self.process = process
         self._is_due = False
         self._is_queued = False
@@ -132,7 +151,7 @@ class ProcessQosEvent(QosEvent):
     """A status that a process wants to hear of. ``number`` is what the process calls it."""
 
     def __init__(
-        self, process: Process, number: int, end: Publisher | ProcessSubscription, status: str
+        self, process: HostProcess, number: int, end: Publisher | ProcessSubscription, status: str
     ) -> None:
         super().__init__(process.dispatcher, end.node)
         self.dispatcher.entities.pending.remove(self)  # it may fire at once, and is then reported
@@ -181,10 +200,18 @@ class ProcessQosEvent(QosEvent):
 _TIMER = struct.Struct("<IIq")
 
 
+class EntityFactory(ExceptionHandler, Protocol):
+    """Where a process finds its peers, and types by their names."""
+
+    domain: Domain
+    message_type: Callable[[str], MessageType]
+    service_type: Callable[[str], ServiceType]
+
+
 class ProcessEntities(dict[int, Any]):
     """What a process has made and not given up; ``records`` are those by which it says so."""
 
-    def __init__(self, adapter: ProcessAdapter, process: Process) -> None:
+    def __init__(self, adapter: EntityFactory, process: HostProcess) -> None:
         super().__init__()
         self._adapter = adapter
         self._process = process

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import Any, Protocol, cast
 
 from rsltrace.adapters.rclpy.concurrency.blocking_calls import abandon
-from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox
+from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox, SpinningExecutor
 from rsltrace.adapters.rclpy.concurrency.mains import crash_program
 from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram
 from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
@@ -26,9 +26,6 @@ from rsltrace.simulation.middleware.events.observer import EventObserver, Observ
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.trace.model.event import NO_EVENT, EventKind, RandomDecision, encode_decision
 from rsltrace.trace.model.texts import format_seconds
-
-if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.executors.executor_driver import ExecutorDriver
 
 
 class FaultedNodes:
@@ -48,7 +45,7 @@ class FaultedNodes:
         self._program = None if program is runtime.programs.host else program
         self._entry = entry
         self._running: list[Any] = []
-        self._spinning: list[tuple[Mailbox, ExecutorDriver]] = []
+        self._spinning: list[tuple[Mailbox, SpinningExecutor]] = []
 
     @property
     def are_destroyed(self) -> bool:

@@ -9,12 +9,12 @@ import shlex
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from inspect import cleandoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.debug.checkpoints import StopReport
 from rsltrace.debug.prompt import show
@@ -23,7 +23,30 @@ from rsltrace.terminal import say
 from rsltrace.trace.words.entities import nodes_called
 
 if TYPE_CHECKING:
-    from rsltrace.debug.prompt.shell import DebugPrompt
+    from rsltrace.conditions.names import RunNames
+    from rsltrace.debug.client import DebugSession
+
+
+class PromptContext(Protocol):
+    """What commands need of the prompt. A command that ends the session sets ``is_over``."""
+
+    session: DebugSession
+    is_over: bool
+
+    def show(self, lines: Iterable[str]) -> None:
+        """Print lines."""
+
+    def stopped(self, stopped: StopReport) -> None:
+        """Print where and why the run has stopped."""
+
+    def read(self, prompt: str) -> str | None:
+        """Return the next line for pdb; None at the end."""
+
+    def node_here(self) -> str | None:
+        """Return the node whose event is about to run, or has just ended."""
+
+    def names(self) -> RunNames:
+        """Return the names there are, as far as they are known."""
 
 
 Run = Callable[[Any, str], object]
@@ -202,25 +225,25 @@ def _place(text: str) -> int | str:
 
 
 @_add("step", "s", usage="[N]", topic="running", repeats=True)
-def _step(shell: DebugPrompt, rest: str) -> None:
+def _step(shell: PromptContext, rest: str) -> None:
     """Run one event, or N."""
     shell.stopped(shell.session.step(_count(rest)))
 
 
 @_add("next", "n", usage="[NODE]", topic="running", repeats=True)
-def _next(shell: DebugPrompt, rest: str) -> None:
+def _next(shell: PromptContext, rest: str) -> None:
     """Run to the end of the next event of this node, or of NODE."""
     shell.stopped(shell.session.next(rest or None))
 
 
 @_add("finish", "fin", topic="running", repeats=True)
-def _finish(shell: DebugPrompt, rest: str) -> None:
+def _finish(shell: PromptContext, rest: str) -> None:
     """Run to the end of this time step."""
     shell.stopped(shell.session.finish())
 
 
 @_add("continue", "c", "cont", topic="running", repeats=True)
-def _continue(shell: DebugPrompt, rest: str) -> None:
+def _continue(shell: PromptContext, rest: str) -> None:
     """Run to the next breakpoint, or to the end.
 
     Ctrl-C stops the run after its present event.
@@ -229,7 +252,7 @@ def _continue(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("run-to", "until", "u", usage="PLACE", topic="running")
-def _run_to(shell: DebugPrompt, rest: str) -> None:
+def _run_to(shell: PromptContext, rest: str) -> None:
     """Run to an event (812) or a time of the run (2.5s), or to a breakpoint before it.
 
     At 812, events 0 to 811 have ended. At 2.5s, all have that there are up to then.
@@ -241,25 +264,25 @@ def _run_to(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("reverse-step", "rs", "back", usage="[N]", topic="going back", repeats=True)
-def _reverse_step(shell: DebugPrompt, rest: str) -> None:
+def _reverse_step(shell: PromptContext, rest: str) -> None:
     """Go back one event, or N."""
     shell.stopped(shell.session.reverse_step(_count(rest)))
 
 
 @_add("reverse-next", "rn", usage="[NODE]", topic="going back", repeats=True)
-def _reverse_next(shell: DebugPrompt, rest: str) -> None:
+def _reverse_next(shell: PromptContext, rest: str) -> None:
     """Go back to the end of the event before, of this node or of NODE."""
     shell.stopped(shell.session.reverse_next(rest or None))
 
 
 @_add("reverse-continue", "rc", topic="going back", repeats=True)
-def _reverse_continue(shell: DebugPrompt, rest: str) -> None:
+def _reverse_continue(shell: PromptContext, rest: str) -> None:
     """Go back to the previous place where a breakpoint stops, or to the beginning."""
     shell.stopped(shell.session.reverse_go_on())
 
 
 @_add("goto", "g", usage="PLACE", topic="going back")
-def _goto(shell: DebugPrompt, rest: str) -> None:
+def _goto(shell: PromptContext, rest: str) -> None:
     """Go to the place before an event (812) or to a time (2.5s), ahead or back.
 
     No breakpoint stops. At 812, events 0 to 811 have ended. At 2.5s, all have that there are up to
@@ -272,7 +295,7 @@ def _goto(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("break", "b", usage="CONDITION", topic="breakpoints")
-def _break(shell: DebugPrompt, rest: str) -> None:
+def _break(shell: PromptContext, rest: str) -> None:
     """Set a breakpoint.
 
     812                           before event 812
@@ -297,13 +320,13 @@ def _break(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("watch", usage="EXPRESSION", topic="breakpoints")
-def _watch(shell: DebugPrompt, rest: str) -> None:
+def _watch(shell: PromptContext, rest: str) -> None:
     """Stop after events that change a value: ekf.P[0][0], node("ekf").P."""
     _break(shell, f"watch {rest}")
 
 
 @_add("delete", "d", usage="[NUMBER]...", topic="breakpoints")
-def _delete(shell: DebugPrompt, rest: str) -> None:
+def _delete(shell: PromptContext, rest: str) -> None:
     """Remove breakpoints, or all."""
     numbers = [_count(word) for word in rest.split()]
     for number in numbers or [one.number for one in shell.session.breakpoints]:
@@ -326,7 +349,7 @@ INFO = {
 
 
 @_add("info", "i", usage="[WHAT]", topic="looking")
-def _info(shell: DebugPrompt, rest: str) -> None:
+def _info(shell: PromptContext, rest: str) -> None:
     """Show breakpoints, nodes, queues, timers, stacks, graph, …; without WHAT, list these."""
     word, _, more = rest.partition(" ")
     if not word:
@@ -353,7 +376,7 @@ def _info(shell: DebugPrompt, rest: str) -> None:
         shell.show(nothing if value is None else show.value_lines(value))
 
 
-def _node(shell: DebugPrompt) -> str:
+def _node(shell: PromptContext) -> str:
     name = shell.node_here()
     if name is None:
         raise DebugError("the current event belongs to no node: give a node")
@@ -361,7 +384,7 @@ def _node(shell: DebugPrompt) -> str:
 
 
 @_add("print", "p", usage="EXPRESSION", topic="looking")
-def _print(shell: DebugPrompt, rest: str) -> None:
+def _print(shell: PromptContext, rest: str) -> None:
     """Evaluate Python: attributes of this node, node("ekf"), fields of its message, msg, now.
 
     This is Python, methods of nodes included, in a copy of the run, so it changes nothing here.
@@ -376,19 +399,19 @@ def _print(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("list", "l", topic="looking")
-def _list(shell: DebugPrompt, rest: str) -> None:
+def _list(shell: PromptContext, rest: str) -> None:
     """Show the source lines of the callback."""
     shell.show(show.source_lines(shell.session.inspect("source")))
 
 
 @_add("where", "w", "bt", topic="looking")
-def _where(shell: DebugPrompt, rest: str) -> None:
+def _where(shell: PromptContext, rest: str) -> None:
     """Show the event here, its cause and its hashes."""
     shell.show(show.where_lines(shell.session.position))
 
 
 @_add("pdb", topic="looking")
-def _pdb(shell: DebugPrompt, rest: str) -> None:
+def _pdb(shell: PromptContext, rest: str) -> None:
     """Call the next callback under pdb, from its first line on.
 
     It runs in a copy, so nothing changes here. "c" or "q" of pdb returns to this prompt, before
@@ -401,7 +424,7 @@ def _pdb(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("gdb", usage="[NODE]", topic="looking")
-def _gdb(shell: DebugPrompt, rest: str) -> None:
+def _gdb(shell: PromptContext, rest: str) -> None:
     """Show the command that attaches gdb to the C or C++ process of a node, for another terminal.
 
     It stops in the next callback: "step" here runs that, and waits while gdb holds the process.
@@ -418,7 +441,7 @@ def _gdb(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("debugpy", usage="[PORT]", topic="looking")
-def _debugpy(shell: DebugPrompt, rest: str) -> None:
+def _debugpy(shell: PromptContext, rest: str) -> None:
     """Continue in a copy of the run under debugpy, for an editor (VS Code): port 5678.
 
     The editor stops in the first line of the next callback, and at its breakpoints; simulated time
@@ -433,7 +456,7 @@ def _debugpy(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("who-changed", "wc", usage="NODE ATTRIBUTE", topic="searching")
-def _who_changed(shell: DebugPrompt, rest: str) -> None:
+def _who_changed(shell: PromptContext, rest: str) -> None:
     """Find the last event up to here that changed an attribute: who-changed ekf P[0][0]."""
     found = _CHANGED.fullmatch(rest)
     if found is None:
@@ -442,7 +465,7 @@ def _who_changed(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("who-sent", "ws", usage="[EVENT]", topic="searching")
-def _who_sent(shell: DebugPrompt, rest: str) -> None:
+def _who_sent(shell: PromptContext, rest: str) -> None:
     """Find the event that sent the input of this one, or of EVENT."""
     position = shell.session.position
     index = _count(rest, position.index if position.is_next else position.index - 1)
@@ -452,7 +475,7 @@ def _who_sent(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("when", usage="CONDITION", topic="searching")
-def _when(shell: DebugPrompt, rest: str) -> None:
+def _when(shell: PromptContext, rest: str) -> None:
     """Find the first event up to here at which a condition (see break) is true.
 
     An expression alone is one, too: when ekf.P[0][0] > 1.
@@ -462,7 +485,7 @@ def _when(shell: DebugPrompt, rest: str) -> None:
     shell.show(show.found_lines(shell.session.first_true(_as_condition(rest, shell))))
 
 
-def _as_condition(text: str, shell: DebugPrompt) -> str:
+def _as_condition(text: str, shell: PromptContext) -> str:
     """Return the condition that a text means: an expression is ``when …``."""
     from rsltrace.conditions.expressions import parse_expression
     from rsltrace.conditions.text import parse_condition
@@ -482,7 +505,7 @@ def _as_condition(text: str, shell: DebugPrompt) -> str:
 
 
 @_add("edit", usage="EDIT", topic="what if")
-def _edit(shell: DebugPrompt, rest: str) -> None:
+def _edit(shell: PromptContext, rest: str) -> None:
     """Change something here, and continue in a branch of the run.
 
     message.data = 3.0                the message that the next event receives
@@ -497,7 +520,7 @@ def _edit(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("keep", usage="FILE", topic="what if")
-def _keep(shell: DebugPrompt, rest: str) -> None:
+def _keep(shell: PromptContext, rest: str) -> None:
     """Write the trace of the current branch to FILE."""
     if not rest:
         raise DebugError("give a file: keep branch.mcap")
@@ -508,12 +531,12 @@ def _keep(shell: DebugPrompt, rest: str) -> None:
 
 
 @_add("help", "h", "?", usage="[COMMAND]", topic="the rest")
-def _help(shell: DebugPrompt, rest: str) -> None:
+def _help(shell: PromptContext, rest: str) -> None:
     """Show this list, or the help of COMMAND."""
     shell.show(COMMANDS.help(rest))
 
 
 @_add("quit", "q", "exit", topic="the rest")
-def _quit(shell: DebugPrompt, rest: str) -> None:
+def _quit(shell: PromptContext, rest: str) -> None:
     """End the session."""
     shell.is_over = True

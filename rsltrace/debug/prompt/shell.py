@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.conditions.names import RunNames
 from rsltrace.debug.prompt import show
-from rsltrace.debug.prompt.command_table import COMMANDS, INFO
+from rsltrace.debug.prompt.command_table import COMMANDS, INFO, PromptContext
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.finding import NondeterminismSource
@@ -95,7 +95,7 @@ def _readline(complete: Completer) -> Iterator[None]:
 _HEADS = "node topic entity output exception log finding watch when t=".split()
 
 
-def completions(text: str, shell: DebugPrompt) -> list[str]:
+def completions(text: str, shell: PromptContext) -> list[str]:
     """Return the completions of the last word of ``text``."""
     words = text.lstrip().split(" ")
     last = words[-1]
@@ -109,7 +109,7 @@ def completions(text: str, shell: DebugPrompt) -> list[str]:
     return _begin(_arguments(name, words[1:-1], shell), last)
 
 
-def _arguments(command: str, before: list[str], shell: DebugPrompt) -> Iterable[str]:
+def _arguments(command: str, before: list[str], shell: PromptContext) -> Iterable[str]:
     names = shell.names()
     if command in ("break", "when") and not before:
         messages = (f"{topic}:" for topic in names.topics)
@@ -140,7 +140,7 @@ def _arguments(command: str, before: list[str], shell: DebugPrompt) -> Iterable[
     return ()
 
 
-def _nodes_as_names(shell: DebugPrompt) -> tuple[str, ...]:
+def _nodes_as_names(shell: PromptContext) -> tuple[str, ...]:
     return tuple(f"{short_name(node)}." for node in shell.names().nodes)
 
 

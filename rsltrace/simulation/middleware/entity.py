@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rsltrace.compiled import EntityFields
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import callback_source
 from rsltrace.trace.model.entity import Entity, EntityKind
-
-if TYPE_CHECKING:
-    from rsltrace.simulation.middleware.graph import Graph
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +46,16 @@ def on_no_executor(
     )
 
 
+class GraphMembership(Protocol):
+    """The graph, as a member sees it."""
+
+    def remove(self, member: Any) -> None:
+        """Forget a member."""
+
+    def services(self, service: str) -> list[Any]:
+        """Return the servers of a service in creation order."""
+
+
 class DomainEntity(EntityFields):
     """Something with an id in the trace: a participant, an endpoint, a timer.
 
@@ -60,7 +67,7 @@ class DomainEntity(EntityFields):
     announced = True
     """Whether the entity is recorded when it is created."""
     begins_active = True
-    graph: Graph | None = None
+    graph: GraphMembership | None = None
     """The graph it has joined."""
 
     def __init__(self, dispatcher: Dispatcher, node: Any) -> None:

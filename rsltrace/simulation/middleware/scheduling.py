@@ -14,7 +14,7 @@ from rsltrace.simulation.loop.ordered import OrderedLoop, ReadyItem, SimulatedEx
 from rsltrace.simulation.loop.policy import Candidate, ExecutionPolicy
 from rsltrace.simulation.middleware.entity import Receiver, Runnable
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.events.event import OutsideEvent
+from rsltrace.simulation.middleware.events.event import EventOwner, OutsideEvent
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.trace.model.event import EventKind, RandomDecision, encode_decision
@@ -194,7 +194,7 @@ class ExecutionTimes(EventObserver):
         call.on_end.append(ended)
         return True
 
-    def _duration_of(self, handle: Any, entity: int, node: Participant | None) -> Sampler | None:
+    def _duration_of(self, handle: Any, entity: int, node: EventOwner | None) -> Sampler | None:
         if entity in self._durations:
             return self._durations[entity]
         sampler = None

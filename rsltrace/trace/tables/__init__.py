@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from rsltrace.trace.tables.rows import (
+    TableInput,
     TraceTable,
     entity_table,
     event_table,
@@ -19,7 +20,6 @@ from rsltrace.trace.tables.rows import (
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder
     from rsltrace.trace.index import ChannelInfo
-    from rsltrace.trace.reader import Trace
 
 __all__ = ["TraceTable", "TraceTables"]
 
@@ -31,7 +31,7 @@ class TraceTables:
     timer's event) are null.
     """
 
-    def __init__(self, trace: Trace, decoder: Callable[[ChannelInfo], Decoder]) -> None:
+    def __init__(self, trace: TableInput, decoder: Callable[[ChannelInfo], Decoder]) -> None:
         self._trace = trace
         self._decoder = decoder
 

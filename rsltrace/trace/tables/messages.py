@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,14 +17,12 @@ from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import NO_FIELD
 from rsltrace.trace.tables.rows import (
+    TableInput,
     TextDictionary,
     TraceTable,
     node_names,
     whole_numbers,
 )
-
-if TYPE_CHECKING:
-    from rsltrace.trace.reader import Trace
 
 _ROWS_PER_BATCH = 4096
 _BYTES_PER_BATCH = 16 << 20
@@ -44,7 +42,7 @@ class _MessageColumn(NamedTuple):
 
 
 def message_table(
-    trace: Trace,
+    trace: TableInput,
     decoder_of: Callable[[ChannelInfo], Decoder],
     topic: str,
     fields: Sequence[str] | None,
@@ -76,7 +74,7 @@ def message_table(
 def _batches(
     arrow: Any,
     schema: Any,
-    trace: Trace,
+    trace: TableInput,
     channel: ChannelInfo,
     decoder: Decoder,
     chosen: Sequence[_MessageColumn],
@@ -126,7 +124,7 @@ def _batches(
 class _Senders:
     """By the number of a channel's message: its event and its sender."""
 
-    def __init__(self, trace: Trace, channel: ChannelInfo) -> None:
+    def __init__(self, trace: TableInput, channel: ChannelInfo) -> None:
         sent = {
             (kind.value, entity)
             for entity in trace.entities
@@ -162,7 +160,7 @@ class _Senders:
         return events, owners
 
 
-def _channel(trace: Trace, topic: str, type_name: str | None) -> ChannelInfo:
+def _channel(trace: TableInput, topic: str, type_name: str | None) -> ChannelInfo:
     found = [channel for channel in trace.channels.values() if channel.topic == topic]
     if not found:
         topics = {channel.topic for channel in trace.channels.values()}
@@ -181,7 +179,7 @@ def _channel(trace: Trace, topic: str, type_name: str | None) -> ChannelInfo:
 
 
 def _selected_columns(
-    trace: Trace, decoder: Decoder, topic: str, fields: Sequence[str] | None
+    trace: TableInput, decoder: Decoder, topic: str, fields: Sequence[str] | None
 ) -> list[_MessageColumn]:
     """Return the columns for the requested fields, in order."""
     if isinstance(fields, str):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +21,12 @@ from rsltrace.trace.model.event import (
     NO_SEQUENCE,
     EventFlag,
     EventKind,
+    Output,
     OutputKind,
 )
 
 if TYPE_CHECKING:
-    from rsltrace.trace.reader import Trace
+    from rsltrace.trace.index import ChannelInfo
 
 # A table whose rows are read when needed: for Arrow, pandas, or as a stream.
 
@@ -101,6 +102,21 @@ def _missing(package: str) -> SetupError:
 _WHOLE_MAX = np.uint64(2**63 - 1)
 
 
+class TableInput(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def entities(self) -> dict[int, Entity]: ...
+    @property
+    def channels(self) -> Mapping[int, ChannelInfo]: ...
+    def events(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]: ...
+    def outputs(
+        self, first: int = 0, last: int | None = None
+    ) -> Iterator[npt.NDArray[np.void]]: ...
+    def channel_of(self, output: Output) -> ChannelInfo | None: ...
+    def messages_of(self, channels: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]: ...
+
+
 class TextDictionary:
     """Texts shared by many rows, in Arrow's dictionary encoding."""
 
@@ -128,7 +144,7 @@ def node_names(entities: Mapping[int, Entity]) -> dict[int, str | None]:
     return {number: node.name if node and node.id else None for number, node in nodes.items()}
 
 
-def event_table(trace: Trace, first: int, last: int | None) -> TraceTable:
+def event_table(trace: TableInput, first: int, last: int | None) -> TraceTable:
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
         whole, hashes, number = arrow.int64(), arrow.uint64(), arrow.uint32()
         entities = trace.entities
@@ -182,7 +198,7 @@ def event_table(trace: Trace, first: int, last: int | None) -> TraceTable:
     return TraceTable(make)
 
 
-def output_table(trace: Trace, first: int, last: int | None) -> TraceTable:
+def output_table(trace: TableInput, first: int, last: int | None) -> TraceTable:
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
         whole, number = arrow.int64(), arrow.uint32()
         entities = trace.entities
@@ -228,7 +244,7 @@ def output_table(trace: Trace, first: int, last: int | None) -> TraceTable:
     return TraceTable(make)
 
 
-def entity_table(trace: Trace) -> TraceTable:
+def entity_table(trace: TableInput) -> TraceTable:
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
         entities = list(trace.entities.values())
         nodes = node_names(trace.entities)
@@ -249,7 +265,7 @@ def entity_table(trace: Trace) -> TraceTable:
     return TraceTable(make)
 
 
-def whole_numbers(trace: Trace, values: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
+def whole_numbers(trace: TableInput, values: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
     """Return indexes or stamps as signed integers, which can be subtracted."""
     if len(values) and values.max() > _WHOLE_MAX:
         raise TraceError(f"{trace.name}: an event is later than any time of ROS")
@@ -257,7 +273,7 @@ def whole_numbers(trace: Trace, values: npt.NDArray[np.uint64]) -> npt.NDArray[n
 
 
 def check_kinds(
-    trace: Trace, values: npt.NDArray[np.unsignedinteger], known: type[IntEnum]
+    trace: TableInput, values: npt.NDArray[np.unsignedinteger], known: type[IntEnum]
 ) -> None:
     """Raise TraceError for a kind that this version does not know."""
     unknown = set(np.unique(values).tolist()) - {kind.value for kind in known}

@@ -10,13 +10,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.middleware.graph import Graph
-
-if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.executors.executor_driver import ExecutorDriver
 
 
 def servers_text(servers: int) -> str:
@@ -59,12 +56,32 @@ def describe_service_call(graph: Graph, frame: FrameType | None) -> str:
     return ""
 
 
+class CallbackRunner(Protocol):
+    """A spinning stack."""
+
+    def runs(self, mailbox: Mailbox, item: Dispatchable) -> bool:
+        """Run an item at once, if that is possible."""
+
+
+class SpinningExecutor(Protocol):
+    """The driver of an executor that takes from a mailbox."""
+
+    executor: Any
+
+    @property
+    def standby(self) -> CallbackRunner | None:
+        """The spinning stack, if it can run an item at once."""
+
+    def wake(self) -> None:
+        """Look for items again."""
+
+
 class Mailbox:
     """Ready items of one node, each with its place in the order of all arrivals."""
 
     def __init__(self, loop: EventLoop) -> None:
         self._next_place = loop.next_place
-        self.driver: ExecutorDriver | None = None
+        self.driver: SpinningExecutor | None = None
         """The driver of the node's executor."""
         self.closed = False
         """Whether the node's process has ended."""

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from greenlet import greenlet
 
@@ -22,14 +22,21 @@ from rsltrace.simulation.middleware.events.failure import RaisedException
 from rsltrace.simulation.middleware.interface import callback_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 
-if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.handles.context import ContextHandle
-
 _FAILURES_MAX = 16
 """A main may catch a million exceptions; the one that ends it is one of the last."""
 
 ExitHandler = tuple[Callable[..., object], tuple[Any, ...], dict[str, Any]]
 """The arguments of ``atexit.register``."""
+
+
+class ProgramContext(Protocol):
+    """A context that a program has initialized."""
+
+    def ok(self) -> bool:
+        """Return whether it has not been shut down."""
+
+    def end(self) -> None:
+        """Shut down from outside, as a signal does."""
 
 
 class SimulatedPrograms:
@@ -49,7 +56,7 @@ class SimulatedPrograms:
         self.all: list[SimulatedProgram] = []
         self.constructing: JobEntry | None = None
         self.importing = False
-        self.main_context: ContextHandle | None = None
+        self.main_context: ProgramContext | None = None
         self.fed = False
         self.to_come: list[str] = []
         self.listeners: list[Callable[[str, str], None]] = []
@@ -95,7 +102,7 @@ class SimulatedProgram:
         self.entity_id = 0
         self.begun_ns: int | None = None
         self.announced = True
-        self.contexts: list[ContextHandle] = []
+        self.contexts: list[ProgramContext] = []
         self.failures: deque[RaisedException] = deque(maxlen=_FAILURES_MAX)
         """Exceptions of callbacks that left a spin of this program, the latest last."""
         self.exit_handlers: list[ExitHandler] = []

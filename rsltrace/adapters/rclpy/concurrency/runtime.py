@@ -14,7 +14,7 @@ import traceback
 from _thread import get_ident
 from collections.abc import Callable
 from dataclasses import field
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 from greenlet import getcurrent, greenlet
@@ -22,7 +22,7 @@ from greenlet import getcurrent, greenlet
 from rsltrace.adapters.rclpy.concurrency.callback_groups import CallbackGroups
 from rsltrace.adapters.rclpy.concurrency.coroutines import Coroutines
 from rsltrace.adapters.rclpy.concurrency.mailbox import describe_service_call
-from rsltrace.adapters.rclpy.concurrency.program import SimulatedPrograms
+from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram, SimulatedPrograms
 from rsltrace.errors import EXIT_RUN
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.callers import is_user_or_library_file
@@ -31,9 +31,6 @@ from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.entity import Runnable
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
-
-if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.concurrency.threads import SimThread
 
 _RESUME = int(EventKind.RESUME)
 
@@ -250,12 +247,32 @@ class BlockedCall:
         return f"{self.describe()} waits for {what}{hint}{where}"
 
 
+class UserThread(Protocol):
+    """A thread that user code has started."""
+
+    ident: int
+    daemon: bool
+    ended: bool
+    program: SimulatedProgram
+    node: Any
+    thread: Any
+
+    def join(self, timeout: float | None) -> None:
+        """Wait until it has ended."""
+
+    def dismiss(self) -> None:
+        """Let the worker of a pool end after its work."""
+
+    def end(self) -> None:
+        """Mark it as ended."""
+
+
 class UserThreads:
     """The running threads of user code, and their stacks."""
 
     def __init__(self) -> None:
-        self.alive: dict[SimThread, None] = {}
-        self.by_stack: dict[greenlet, SimThread] = {}
+        self.alive: dict[UserThread, None] = {}
+        self.by_stack: dict[greenlet, UserThread] = {}
         self.count = 0
 
     def runs_on(self, stack: greenlet) -> bool:

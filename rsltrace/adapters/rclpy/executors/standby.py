@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
 from types import CodeType, FrameType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from greenlet import getcurrent, greenlet
 
@@ -28,17 +28,21 @@ from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
 from rsltrace.simulation.middleware.events.event import OutsideEvent
 from rsltrace.simulation.middleware.subscription import NUMBER
 
-if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.executors.executor_driver import ExecutorDriver
+
+class StandbyOwner(Protocol):
+    """The driver of the spinning executor."""
+
+    executor: Any
+    standby: Standby | None
+    waits: list[BlockedCall]
+    woken: bool
 
 
 class Standby:
     """One spinning stack. ``future`` is what it spins for (None: for ever). With ``once`` the spin
     goes on after each callback."""
 
-    def __init__(
-        self, runtime: Runtime, driver: ExecutorDriver, future: Any, *, once: bool
-    ) -> None:
+    def __init__(self, runtime: Runtime, driver: StandbyOwner, future: Any, *, once: bool) -> None:
         self._runtime = runtime
         self._loop = runtime.loop
         self._dispatcher = runtime.dispatcher
@@ -192,7 +196,7 @@ def _is_free(item: Any) -> bool:
 
 def standby_of(
     runtime: Runtime,
-    driver: ExecutorDriver,
+    driver: StandbyOwner,
     nodes: object,
     condition: Callable[[], bool],
     *,

@@ -6,7 +6,7 @@ import sys
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rsltrace.adapters.rclpy.arguments import (
     InvalidArgumentsError,
@@ -26,15 +26,22 @@ from rsltrace.simulation.middleware.events.event import NameRequester
 from rsltrace.simulation.middleware.graph import Graph, action_names_and_types, names_and_types
 from rsltrace.simulation.middleware.participant import Participant, full_name
 
-if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
-
 _GROUP_KINDS = {
     "MutuallyExclusiveCallbackGroup": "mutually exclusive",
     "ReentrantCallbackGroup": "reentrant",
 }
 _FRAMES_MAX = 10
 """There are two or three between the boundary and the constructor of ``rclpy.Node``."""
+
+
+class LogSink(Protocol):
+    """Publishes the log records of nodes on /rosout."""
+
+    def attach(self, node: Any, qos: Any = None) -> None:
+        """Give a node its /rosout publisher."""
+
+    def detach(self, node: Any) -> None:
+        """Forget a node."""
 
 
 _GROUPS: weakref.WeakKeyDictionary[NodeHandle, list[weakref.ref[Any]]] = weakref.WeakKeyDictionary()
@@ -56,7 +63,7 @@ class NodeHandle(Destroyable, Participant):
         self,
         real: Any,
         runtime: Runtime,
-        logs: RosoutLogs,
+        logs: LogSink,
         states: NodeStates,
         node_name: str,
         namespace: str,

@@ -15,6 +15,7 @@ from rsltrace.errors import OutputError
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.middleware.events.event import (
     CurrentEvent,
+    EventOwner,
     ExceptionHandler,
     NameRegistry,
     OutsideEvent,
@@ -31,9 +32,6 @@ from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.operation import pack_operation
 from rsltrace.trace.recorder import Recorder
-
-if TYPE_CHECKING:
-    from rsltrace.simulation.middleware.participant import Participant
 
 
 class Recordable(Protocol):
@@ -109,7 +107,7 @@ class PythonEventEnd:
         self,
         handle: Dispatchable,
         entity: int,
-        node: Participant | None,
+        node: EventOwner | None,
         kind: int,
         callback: Callable[..., object],
         args: tuple[Any, ...],

@@ -121,12 +121,21 @@ class ParticipantState(Protocol):
         """Return the hash now, 0 if there is none."""
 
 
+class EventOwner(Protocol):
+    """A participant, as the recording code sees it."""
+
+    entity_id: int
+    fully_qualified_name: str
+    state: ParticipantState | None
+    exception_handler: ExceptionHandler
+
+
 class CurrentEvent(EventFields):
     """The current event: one object that each event fills in anew.
 
     What it sends leaves ``busy_ns`` later (execution times), and its executor is busy for
     ``took_ns``. A ``quiet`` event is recorded only if something comes of it. ``on_end`` is called
-    after it. ``node`` is a ``Participant`` or None.
+    after it. ``node`` is an ``EventOwner`` or None.
     """
 
     def __init__(self) -> None:
