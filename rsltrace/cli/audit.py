@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.cli.job_source import Override, RosArgsCommand, job_of, job_options
+from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 from rsltrace.errors import EXIT_USAGE
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import printable
@@ -39,10 +39,7 @@ _FORMATS = ("text", "json", "github")
     help="Show only what the guard does not make deterministic.",
 )
 def audit(
-    words: tuple[str, ...],
-    launch: Path | None,
-    skip: bool,
-    overrides: tuple[Override, ...],
+    given: JobArguments,
     form: str,
     as_json: bool,
     unguarded: bool,
@@ -59,7 +56,7 @@ def audit(
 
     Exit status: 0 without findings, 1 with findings, 2 for an error.
     """
-    result = _look(words, launch, skip, overrides)
+    result = _look(given)
     from rsltrace.guard.audit.audit import SAFE_TREATMENTS
 
     found = [one for one in result.found if not (unguarded and one.treatment in SAFE_TREATMENTS)]
@@ -76,21 +73,20 @@ def audit(
     return EXIT_USAGE if result.troubles else 1 if found else 0
 
 
-def _look(
-    words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[Override]
-) -> AuditReport:
+def _look(given: JobArguments) -> AuditReport:
     from rsltrace.guard.audit.audit import audit_job, audit_path
 
-    only = Path(words[0]) if len(words) == 1 and launch is None else None
+    words = given.words
+    only = Path(words[0]) if len(words) == 1 and given.launch is None else None
     if only is not None and (only.is_dir() or only.suffix == ".py"):
-        if overrides:
+        if given.overrides:
             raise click.UsageError(f"--set needs a job, and {only} is not one")
         return audit_path(only)
     from rsltrace.run.inputs import expand_launch_files
     from rsltrace.run.plans.executables import executable_source
     from rsltrace.run.process import search_path
 
-    job, _ = job_of(words, launch, skip, overrides)
+    job, _ = given.job()
     expanded = expand_launch_files(job)
     with search_path(job):
         from rsltrace.adapters.workspace.installs import module_folders

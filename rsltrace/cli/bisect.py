@@ -6,19 +6,13 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.job_source import (
-    Override,
-    RosArgsCommand,
-    check_named,
-    job_of,
-    job_options,
-    ros_arguments_given,
-)
+from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 from rsltrace.cli.options import (
     json_option,
     no_pin_option,
@@ -26,7 +20,7 @@ from rsltrace.cli.options import (
     timeout_option,
     until_option,
 )
-from rsltrace.cli.verify import JobArguments, handling_signals
+from rsltrace.cli.verify import handling_signals
 from rsltrace.errors import BisectError, JobError, OutputError
 from rsltrace.terminal import say, tell
 
@@ -83,10 +77,7 @@ _BEFORE, _AFTER = "before.mcap", "after.mcap"
 @json_option
 @click.option("-q", "--quiet", is_flag=True, help="Show no progress.")
 def bisect(
-    words: tuple[str, ...],
-    launch: Path | None,
-    skip: bool,
-    overrides: tuple[Override, ...],
+    given: JobArguments,
     good: str,
     bad: str,
     expression: str | None,
@@ -121,7 +112,7 @@ def bisect(
 
     if expression is not None and shell is not None:
         raise click.UsageError("give --check or --run, not both")
-    given = JobArguments(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
+    given = replace(given, seed=seed, until=until, no_pin=no_pin)
     files = _named(given)
     if output is not None and not force:
         _check_free(output)
@@ -165,9 +156,8 @@ def _check(expression: str | None, shell: str | None, processes: Processes) -> R
 
 def _named(given: JobArguments) -> list[Path]:
     """Return the files that the command line names, the job's (or launch file's) first."""
-    files = [Path(word) for word in given.words if ":=" not in word]
-    files += [given.launch] if given.launch is not None else []
-    check_named(files, given.launch, given.overrides)
+    given.check_named()
+    files = [*map(Path, given.files), *([] if given.launch is None else [given.launch])]
     files = files or [Path("run")]  # programs have no file, but a folder
     ros = given.ros
     files += [Path(ros[at + 1]) for at, word in enumerate(ros[:-1]) if word == "--params-file"]
@@ -194,7 +184,7 @@ def _check_ends(repository: GitRepository, good: Any, bad: Any) -> None:
 def _job_here(given: JobArguments) -> Job | None:
     """Return the job in the checkout, or None if it is broken: revisions have their own."""
     try:
-        return job_of(given.words, given.launch, given.skip, given.overrides)[0]
+        return given.job()[0]
     except JobError:
         return None
 

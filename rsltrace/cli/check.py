@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.job_source import Override, RosArgsCommand, job_of, job_options
+from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, NodeError, RunError
 from rsltrace.terminal import say, tell
@@ -53,10 +53,7 @@ if TYPE_CHECKING:
     help="Include what every node has: /rosout, parameter services and so on.",
 )
 def check(
-    words: tuple[str, ...],
-    launch: Path | None,
-    skip: bool,
-    overrides: tuple[Override, ...],
+    given: JobArguments,
     form: str,
     graph: Path | None,
     other: Path | None,
@@ -84,15 +81,16 @@ def check(
 
     if graph is not None and graph.suffix != ".svg":
         raise click.BadParameter(f"{graph} should end in .svg", param_hint="--graph")
+    words = given.words
     if len(words) == 1 and is_trace(words[0]):
-        if graph is not None or everything or overrides or launch is not None:
+        if graph is not None or everything or given.overrides or given.launch is not None:
             raise click.UsageError(
                 f"{words[0]} is a trace: --graph, --all, --set and --launch need a job"
             )
         return _check_trace(Path(words[0]), other, form)
     if other is not None:
         raise click.UsageError("--job needs a trace: rsltrace check run.mcap --job job.yaml")
-    loaded, _ = job_of(words, launch, skip, overrides)
+    loaded, _ = given.job()
     check_texts(loaded)
     check_metrics(loaded)
     try:
@@ -120,7 +118,7 @@ def check(
         for note in checked.notes:
             tell(f"rsltrace: note: {note}")
         say("\n".join(map(printable, _text(checked.job, checked))))
-        if not checked.problems and launch is None and not overrides:
+        if not checked.problems and given.launch is None and not given.overrides:
             tell(f"next: rsltrace record {shlex.join(words)}")
     return 1 if checked.problems else 0
 

@@ -12,19 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.job_source import (
-    Override,
-    RosArgsCommand,
-    all_overrides,
-    job_options,
-    job_words,
-    ros_arguments_given,
-    source_name,
-)
+from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 from rsltrace.cli.options import history_option, job_folder_option, trust_option
 from rsltrace.cli.output.exit_status import interrupted_status
 from rsltrace.cli.record import default_output
-from rsltrace.cli.verify import JobArguments, handling_signals
+from rsltrace.cli.verify import handling_signals
 from rsltrace.errors import ExploreError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.regular_file import replacement_of
@@ -176,10 +168,7 @@ output_option = click.option(
 @history_option
 @click.option("-q", "--quiet", is_flag=True, help="Show only the result, no progress.")
 def explore(
-    words: tuple[str, ...],
-    launch: Path | None,
-    skip: bool,
-    overrides: tuple[Override, ...],
+    given: JobArguments,
     strategy: str,
     budget: SearchBudget,
     stop_at_first: bool,
@@ -224,15 +213,14 @@ def explore(
         raise click.UsageError(
             "give --resume to continue a search or --force to replace it, not both"
         )
-    named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
+    named, changes, text = given.overridden(None, until).named()
     default = default_output(named).with_suffix(".explore")
     if text is None and is_trace(named):
         named = _job_of_native(named, job_folder, trust=trust, force=force, quiet=quiet)
         fork_after = fork_after or ("0s", 0)
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
-    source = JobSource(source_name(named, launch, text), labelled, text, str(named.parent))
-    given = JobArguments(words, launch, skip, overrides, None, until, False, ros_arguments_given())
-    with given.recorded(history, "explore") as record:
+    source = JobSource(given.source_name(named), labelled, text, str(named.parent))
+    with replace(given, until=until).recorded(history, "explore") as record:
         job = source.job()
         if job.policy is not None and job.policy.recorded is not None:
             source, fork_after = _leaving_recorded(source, job.policy, fork_after)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import click
 
 from rsltrace.cli.explore import budget_option, explore, jobs_option, output_option
-from rsltrace.cli.job_source import Override, RosArgsCommand, job_options, programs_given
+from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 
 _DELAY = 'delay.default={"lognormal": {"median": "1ms", "sigma": 1.5}}'
 """Mostly a millisecond, one in a hundred over 30 ms: messages of other topics overtake each other
@@ -23,7 +24,7 @@ as on a loaded machine."""
 @click.option("--resume", is_flag=True, help="Continue the search in the output folder.")
 @click.option("--force", is_flag=True, help="Replace the search in the output folder.")
 @click.option("-q", "--quiet", is_flag=True, help="Show only the result, no progress.")
-def flaky(overrides: tuple[Override, ...], **options: Any) -> int:
+def flaky(given: JobArguments, **options: Any) -> int:
     """Run a test in many callback orders and with many delays, and keep the smallest run that
     fails and the nearest that passes.
 
@@ -38,11 +39,11 @@ def flaky(overrides: tuple[Override, ...], **options: Any) -> int:
 
     Exit status: 0 if it never failed, 1 if it did, 2 for an error.
     """
-    if not programs_given():
+    if not given.program:
         raise click.UsageError("name the test after '--': rsltrace flaky -- pytest FILE")
     assert explore.callback is not None
     status: int = explore.callback(
-        overrides=(_DELAY, *overrides),
+        replace(given, overrides=(_DELAY, *given.overrides)),
         strategy="mixed",
         depth=None,
         seed=0,

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shlex
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,18 +15,16 @@ import click
 
 from rsltrace.cli.completion import complete_files
 from rsltrace.cli.options import set_option
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.mappings import split_ros_arguments
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
+    from rsltrace.search.history.run_record import RunRecord
 
-_META = "rsltrace.ros_args"
-_PROGRAMS = "rsltrace.programs"
 _ADDED = ("nodes.+=", "launch.+=", "bags.+=")
 Override = str | tuple[str, str]
 """A ``--set``, or an option and what that sets."""
-_BAGS = "rsltrace.bags"
-_FOLDER = "rsltrace.override_folder"
 
 
 class RosArgsCommand(click.Command):
@@ -34,35 +34,47 @@ class RosArgsCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Remove the ROS arguments and the programs before click parses the others."""
         args, programs = split_programs(args)
-        own, ctx.meta[_META] = split_ros_arguments(args)
+        own, ros = split_ros_arguments(args)
         left = super().parse_args(ctx, own)
         if ctx.resilient_parsing:
             return left
-        params = ctx.params
-        if params.get("launch") is not None:
+        take = ctx.params.pop
+        words, launch, bags, overrides = (
+            take(name) for name in ("words", "launch", "bag", "overrides")
+        )
+        if launch is not None:
             from rsltrace.adapters.launch.file_lookup import launch_file
 
-            launch, words = launch_file(params["launch"], params["words"])
-            params.update(launch=launch, words=tuple(words))
-        entries = [("--bag", ("bags", {"path": str(path)})) for path in ctx.meta.get(_BAGS, ())]
+            launch, words = launch_file(launch, words)
+        entries = [("--bag", ("bags", {"path": str(path)})) for path in bags]
+        program = ""
         if programs is not None:
             from rsltrace.cli.programs import program_entries, program_name
 
-            if params["launch"] is not None or params["words"]:
-                given = params["words"][0] if params["words"] else "--launch"
+            if launch is not None or words:
+                given = words[0] if words else "--launch"
                 raise click.UsageError(
                     f"give {given} or programs after '--', not both (--bag, --set and --until go "
                     "with programs, too)"
                 )
             named = program_entries(programs)
-            ctx.meta[_PROGRAMS] = program_name(named[0])
-            written = [f"-- {shlex.join(words)}" for words in programs]
+            program = program_name(named[0])
+            written = [f"-- {shlex.join(one)}" for one in programs]
             entries = [*zip(written, named, strict=True), *entries]
         more = (
             (option, f"{key}.+={json.dumps(entry, ensure_ascii=False)}")
             for option, (key, entry) in entries
         )
-        params["overrides"] = (*more, *params["overrides"])
+        ctx.params["given"] = JobArguments(
+            words=tuple(words),
+            launch=launch,
+            skip=take("skip"),
+            overrides=(*more, *overrides),
+            ros=tuple(ros),
+            folder=take("override_folder") or Path(),
+            program=program,
+            bags=bags,
+        )
         return left
 
 
@@ -85,19 +97,17 @@ def split_programs(words: Sequence[str]) -> tuple[list[str], list[list[str]] | N
     return list(words), None
 
 
-def _keep_bags(context: click.Context, option: click.Parameter, bags: Sequence[Path]) -> None:
+def _check_bags(
+    context: click.Context, option: click.Parameter, bags: tuple[Path, ...]
+) -> tuple[Path, ...]:
     for bag in bags:
         if not bag.exists() and not context.resilient_parsing:
             raise click.BadParameter(f"there is no bag {bag} (record --export-bag writes one)")
-    context.meta[_BAGS] = bags
-
-
-def _keep_folder(context: click.Context, option: click.Parameter, folder: Path | None) -> None:
-    context.meta[_FOLDER] = folder or Path()
+    return bags
 
 
 def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add ``words``, ``launch``, ``skip`` and ``overrides`` (see ``job_of``) to a command."""
+    """Add the options that name a job to a command (a ``RosArgsCommand``): its ``given``."""
     for decorate in reversed(
         (
             click.argument(
@@ -124,16 +134,11 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 multiple=True,
                 type=click.Path(path_type=Path),
                 metavar="BAG",
-                expose_value=False,
-                callback=_keep_bags,
+                callback=_check_bags,
                 help="Play this recording into the run, as bags: in a job does. Repeatable.",
             ),
             click.option(  # of child processes, whose working directory may be another one
-                "--override-folder",
-                hidden=True,
-                type=click.Path(path_type=Path),
-                expose_value=False,
-                callback=_keep_folder,
+                "--override-folder", hidden=True, type=click.Path(path_type=Path)
             ),
             click.option(
                 "--ros-args",
@@ -148,121 +153,135 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return function
 
 
-def programs_given() -> bool:
-    """Return whether this command line names programs in place of a job."""
-    return _PROGRAMS in click.get_current_context().meta
+@dataclass(frozen=True, slots=True)
+class JobArguments:
+    """What a command line says of its job. ``overrides`` are those of ``--set`` and of what stands
+    for one; ``seed``, ``until`` and ``no_pin`` are for child processes only.
 
-
-def bags_given() -> bool:
-    """Return whether this command line names a bag."""
-    return bool(click.get_current_context().meta[_BAGS])
-
-
-def check_named(
-    files: Sequence[object], launch: Path | None, overrides: Iterable[Override]
-) -> None:
-    """Raise UsageError if this command line says nothing that a job could run."""
-    texts = (one if isinstance(one, str) else one[1] for one in overrides)
-    if not (files or launch or any(text.startswith(_ADDED) for text in texts)):
-        raise click.UsageError("Missing argument 'JOB' (or --launch FILE, or -- PROGRAM).")
-
-
-def override_folder() -> Path:
-    """Return where the paths of a command line start."""
-    return Path(click.get_current_context().meta[_FOLDER])
-
-
-def source_name(named: Path, launch: Path | None, text: str | None) -> str:
-    """Return what messages and traces call a job of ``job_words``."""
-    from rsltrace.job.fields import COMMAND_LINE
-
-    return COMMAND_LINE if text is not None and launch is None else str(named)
-
-
-def ros_arguments_given() -> tuple[str, ...]:
-    """Return the arguments between ``--ros-args`` and ``--`` of this command line."""
-    return tuple(click.get_current_context().meta.get(_META, ()))
-
-
-def job_of(
-    words: Sequence[str],
-    launch: Path | None,
-    skip: bool,
-    overrides: Sequence[Override],
-) -> tuple[Job, Path]:
-    """Return the job, and the path of the file that names it.
-
-    :raises click.UsageError: the arguments contradict each other.
-    :raises JobError: the job is wrong.
+    ``folder`` is where its paths start, ``program`` the name of the first program that is given in
+    place of a job.
     """
-    from rsltrace.job import job_from_text, load_job
 
-    named, changes, text = job_words(words, launch, skip, overrides)
-    folder = override_folder()
-    if text is None:
-        return load_job(named, overrides=changes, given_in=folder), named
-    return job_from_text(
-        text, source_name(named, launch, text), named.parent, overrides=changes, given_in=folder
-    ), named
+    words: tuple[str, ...]
+    launch: Path | None
+    skip: bool
+    overrides: tuple[Override, ...]
+    ros: tuple[str, ...]
+    folder: Path
+    program: str
+    bags: tuple[Path, ...]
+    seed: int | None = None
+    until: str | None = None
+    no_pin: bool = False
 
+    @property
+    def files(self) -> list[str]:
+        """The words that are no launch arguments."""
+        return [word for word in self.words if ":=" not in word]
 
-def job_words(
-    words: Sequence[str],
-    launch: Path | None,
-    skip: bool,
-    overrides: Sequence[Override],
-) -> tuple[Path, list[Override], str | None]:
-    """Return the path of the job or launch file, all overrides, and the job's text if there is
-    no job file.
+    def overridden(
+        self, seed: int | None, until: str | None, last: str | None = None
+    ) -> JobArguments:
+        """Return the arguments with the overrides of ``--seed``, ``--until`` and ``--last``."""
+        found = list(self.overrides)
+        if seed is not None:
+            found.append(("--seed", f"seed={seed}"))
+        if until is not None:
+            key = "time" if until.startswith("@") else "duration"
+            found.append(("--until", f"stop.{key}={_time(until.removeprefix('@'))}"))
+        if last is not None:
+            found.append(("--last", f"record.last.duration={_time(last)}"))
+        return replace(self, overrides=tuple(found))
 
-    :raises click.UsageError: the arguments contradict each other.
-    """
-    files = [word for word in words if ":=" not in word]
-    given = dict(word.split(":=", 1) for word in words if ":=" in word)
-    if len(files) > 1:
-        raise click.UsageError(f"give one JOB, not {' and '.join(files)}")
-    check_named(files, launch, overrides)
-    if launch is None and (given or skip):
-        what = f"{next(iter(given))}:=… is a launch argument" if given else "--skip-unsupported"
-        raise click.UsageError(f"{what}: give the launch file with --launch FILE")
-    if launch is not None and launch.suffix == ".mcap":
-        raise click.UsageError(f"{launch} is a trace, not a launch file")
-    name = click.get_current_context().meta.get(_PROGRAMS, "run")
-    named = Path(files[0]) if files else launch or override_folder() / name
-    changes = list(overrides)
-    if launch is not None:
-        spec: dict[str, Any] = {"file": str(launch), "arguments": given}
-        if skip:
-            spec["skip_unsupported"] = True
-        changes.append(("--launch", f"launch.+={json.dumps(spec, ensure_ascii=False)}"))
-    ros = click.get_current_context().meta.get(_META, [])
-    changes += [f"ros_arguments.+={json.dumps(word)}" for word in _with_paths(ros, named.parent)]
-    return named, changes, None if files else "{}"
+    def job(self) -> tuple[Job, Path]:
+        """Return the job, and the path of the file that names it.
 
+        :raises click.UsageError: the arguments contradict each other.
+        :raises JobError: the job is wrong.
+        """
+        from rsltrace.job import job_from_text, load_job
 
-def all_overrides(
-    overrides: Sequence[Override], seed: int | None, until: str | None, last: str | None = None
-) -> list[Override]:
-    """Return the overrides of ``--set``, then those of ``--seed``, ``--until`` and ``--last``."""
-    found: list[Override] = list(overrides)
-    if seed is not None:
-        found.append(("--seed", f"seed={seed}"))
-    if until is not None:
-        key = "time" if until.startswith("@") else "duration"
-        found.append(("--until", f"stop.{key}={_time(until.removeprefix('@'))}"))
-    if last is not None:
-        found.append(("--last", f"record.last.duration={_time(last)}"))
-    return found
+        named, changes, text = self.named()
+        if text is None:
+            return load_job(named, overrides=changes, given_in=self.folder), named
+        name = self.source_name(named)
+        return job_from_text(
+            text, name, named.parent, overrides=changes, given_in=self.folder
+        ), named
+
+    def check_named(self) -> None:
+        """Raise UsageError if this command line says nothing that a job could run."""
+        texts = (one if isinstance(one, str) else one[1] for one in self.overrides)
+        if not (self.files or self.launch or any(text.startswith(_ADDED) for text in texts)):
+            raise click.UsageError("Missing argument 'JOB' (or --launch FILE, or -- PROGRAM).")
+
+    def named(self) -> tuple[Path, list[Override], str | None]:
+        """Return the path of the job or launch file, all overrides, and the job's text if there is
+        no job file.
+
+        :raises click.UsageError: the arguments contradict each other.
+        """
+        files, launch = self.files, self.launch
+        arguments = dict(word.split(":=", 1) for word in self.words if ":=" in word)
+        if len(files) > 1:
+            raise click.UsageError(f"give one JOB, not {' and '.join(files)}")
+        self.check_named()
+        if launch is None and (arguments or self.skip):
+            first = next(iter(arguments), "")
+            what = f"{first}:=… is a launch argument" if arguments else "--skip-unsupported"
+            raise click.UsageError(f"{what}: give the launch file with --launch FILE")
+        if launch is not None and launch.suffix == ".mcap":
+            raise click.UsageError(f"{launch} is a trace, not a launch file")
+        named = Path(files[0]) if files else launch or self.folder / (self.program or "run")
+        changes = list(self.overrides)
+        if launch is not None:
+            spec: dict[str, Any] = {"file": str(launch), "arguments": arguments}
+            if self.skip:
+                spec["skip_unsupported"] = True
+            changes.append(("--launch", f"launch.+={json.dumps(spec, ensure_ascii=False)}"))
+        words = self._ros_with(lambda path: os.path.relpath(path, named.parent))
+        changes += [f"ros_arguments.+={json.dumps(word)}" for word in words]
+        return named, changes, None if files else "{}"
+
+    def source_name(self, named: Path) -> str:
+        """Return what messages and traces call the job."""
+        from rsltrace.job.fields import COMMAND_LINE
+
+        return str(named) if self.files or self.launch is not None else COMMAND_LINE
+
+    def arguments(self, path: Callable[[str], object] = str) -> list[str]:
+        """Return them as words; ``path`` converts each path for the process that uses them."""
+        found = [word if ":=" in word else str(path(word)) for word in self.words]
+        start = str(path(str(self.folder)))
+        if os.path.isabs(start):  # a child process may have another working directory
+            found += ["--override-folder", start]
+        if self.launch is not None:
+            found += ["--launch", str(path(str(self.launch)))]
+        found += ["--skip-unsupported"] * self.skip
+        for override in self.overrides:
+            found += ["--set", override if isinstance(override, str) else override[1]]
+        if self.seed is not None:
+            found += ["--seed", str(self.seed)]
+        if self.until is not None:
+            found += ["--until", self.until]
+        found += ["--no-pin"] * self.no_pin
+        return found + (["--ros-args", *self._ros_with(path), "--"] if self.ros else [])
+
+    def _ros_with(self, path: Callable[[str], object]) -> list[str]:
+        """Return the ROS arguments with their paths converted."""
+        found = list(self.ros)
+        for index, word in enumerate(found[:-1]):
+            if word == "--params-file":
+                found[index + 1] = str(path(found[index + 1]))
+        return found
+
+    def recorded(self, history: str | None, by: str) -> AbstractContextManager[RunRecord]:
+        """Give the record of this run, which goes to a history."""
+        from rsltrace.search.history.run_record import recorded
+
+        file = next(map(Path, self.files), self.launch or Path())
+        return recorded(history, by, file, self.arguments)
 
 
 def _time(text: str) -> str:
     return json.dumps(f"{text}s" if text[-1:].isdigit() else text)
-
-
-def _with_paths(words: Sequence[str], folder: Path) -> list[str]:
-    """Return ROS arguments with their paths relative to the job's folder."""
-    found = list(words)
-    for index, word in enumerate(found[:-1]):
-        if word == "--params-file":
-            found[index + 1] = os.path.relpath(found[index + 1], folder)
-    return found

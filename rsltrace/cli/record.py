@@ -14,15 +14,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.cli.job_source import (
-    Override,
-    RosArgsCommand,
-    all_overrides,
-    bags_given,
-    job_of,
-    job_options,
-    programs_given,
-)
+from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 from rsltrace.cli.options import json_option, no_pin_option, seed_option, until_option
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.output.search_progress import interruptible, progress
@@ -112,9 +104,7 @@ if TYPE_CHECKING:
 )
 @click.option("--sample-states", is_flag=True, hidden=True)  # as the runs of ``verify`` do
 def record(
-    words: tuple[str, ...],
-    launch: Path | None,
-    skip: bool,
+    given: JobArguments,
     output: Path | None,
     export_bag: Path | None,
     force: bool,
@@ -122,7 +112,6 @@ def record(
     until: str | None,
     replay: Path | None,
     as_json: bool,
-    overrides: tuple[Override, ...],
     print_job: bool,
     no_pin: bool,
     native: bool,
@@ -154,8 +143,7 @@ def record(
     if click.get_current_context().obj is not None:  # a process that is there for this alone
         skip_final_collection()
     _check_options(native, executor, domain, policy, replay, seed, last, processes=processes)
-    changes = all_overrides(overrides, seed, until, last)
-    loaded, named = job_of(words, launch, skip, changes)
+    loaded, named = given.overridden(seed, until, last).job()
     if no_pin:
         guard = loaded.guard.model_copy(update={"pin": False})
         loaded = loaded.model_copy(update={"guard": guard})
@@ -164,7 +152,7 @@ def record(
     if print_job:
         _print_job(loaded)
         return
-    if programs_given() and not (quiet or as_json):
+    if given.program and not (quiet or as_json):
         tell(f"the job (--print-job before '--' prints it alone):\n{loaded.to_yaml()}", end="")
         if not (loaded.stop.model_fields_set or loaded.bags or any(n.main for n in loaded.nodes)):
             tell("it lasts as long as its programs: --until 10 ends it after 10 s, Ctrl-C at once")
@@ -192,7 +180,8 @@ def record(
     try:
         checked, checks_status = _checked(loaded, result.path)
         status = status or checks_status
-        _report(result, shown_notes, checked, as_json=as_json)
+        silent = _silent_topics(result, plays_bags=bool(given.bags))
+        _report(result, silent, shown_notes, checked, as_json=as_json)
         if export_bag is not None:
             _export(result.path or path, export_bag, force=force)
     except OSError as error:
@@ -353,7 +342,7 @@ def _note(text: str) -> None:
     tell(f"rsltrace: note: {text}")
 
 
-def _silent_topics(result: RunResult) -> list[str]:
+def _silent_topics(result: RunResult, *, plays_bags: bool) -> list[str]:
     """Return notes on topics without a publisher and services without a server."""
     if result.path is None or result.error is not None or not result.path.is_file():
         return []
@@ -363,7 +352,7 @@ def _silent_topics(result: RunResult) -> list[str]:
         with Trace.open(result.path) as trace:
             entities = list(trace.entities.values())
             found = [silent_topics(entities), missing_servers(entities)]
-            if bags_given():  # a job says itself which topics of a bag it plays
+            if plays_bags:  # a job says itself which topics of a bag it plays
                 from rsltrace.run.plans.bags import PLAYER
 
                 found.append(unheard_topics(entities, f"/{PLAYER}"))
@@ -387,10 +376,14 @@ def _checked(job: Job, path: Path | None) -> tuple[CheckReport | None, int]:
 
 
 def _report(
-    result: RunResult, shown_notes: list[str], checked: CheckReport | None, *, as_json: bool
+    result: RunResult,
+    silent: list[str],
+    shown_notes: list[str],
+    checked: CheckReport | None,
+    *,
+    as_json: bool,
 ) -> None:
     error = result.error
-    silent = _silent_topics(result)
     for note in (*result.notes, *silent):
         if note not in shown_notes:  # when the run began
             tell(f"note: {note}")

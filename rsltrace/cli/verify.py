@@ -8,22 +8,15 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.cli.job_source import (
-    Override,
-    RosArgsCommand,
-    job_of,
-    job_options,
-    override_folder,
-    ros_arguments_given,
-)
+from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 from rsltrace.cli.options import (
     history_option,
     json_option,
@@ -38,51 +31,6 @@ from rsltrace.terminal import say, tell
 if TYPE_CHECKING:
     from rsltrace.search.history.run_record import RunRecord
     from rsltrace.search.verify import VerifyResult
-
-
-@dataclass(frozen=True, slots=True)
-class JobArguments:
-    """The options of a command line that choose the job, for its child processes."""
-
-    words: tuple[str, ...]
-    launch: Path | None
-    skip: bool
-    overrides: tuple[Override, ...]
-    seed: int | None
-    until: str | None
-    no_pin: bool
-    ros: tuple[str, ...]
-
-    def arguments(self, path: Callable[[str], object] = str) -> list[str]:
-        """Return the arguments; ``path`` converts each path for the process that uses them."""
-        found = [word if ":=" in word else str(path(word)) for word in self.words]
-        start = str(path(str(override_folder())))
-        if os.path.isabs(start):  # a child process may have another working directory
-            found += ["--override-folder", start]
-        if self.launch is not None:
-            found += ["--launch", str(path(str(self.launch)))]
-        found += ["--skip-unsupported"] * self.skip
-        for override in self.overrides:
-            found += ["--set", override if isinstance(override, str) else override[1]]
-        if self.seed is not None:
-            found += ["--seed", str(self.seed)]
-        if self.until is not None:
-            found += ["--until", self.until]
-        found += ["--no-pin"] * self.no_pin
-        if self.ros:
-            ros = list(self.ros)
-            for index, word in enumerate(ros[:-1]):
-                if word == "--params-file":
-                    ros[index + 1] = str(path(ros[index + 1]))
-            found += ["--ros-args", *ros, "--"]
-        return found
-
-    def recorded(self, history: str | None, by: str) -> AbstractContextManager[RunRecord]:
-        """Give the record of this run, which goes to a history."""
-        from rsltrace.search.history.run_record import recorded
-
-        files = [Path(word) for word in self.words if ":=" not in word]
-        return recorded(history, by, (*files, self.launch or Path())[0], self.arguments)
 
 
 @click.command(cls=RosArgsCommand)
@@ -135,10 +83,7 @@ class JobArguments:
 @history_option
 @json_option
 def verify(
-    words: tuple[str, ...],
-    launch: Path | None,
-    skip: bool,
-    overrides: tuple[Override, ...],
+    given: JobArguments,
     runs: int,
     jobs: int,
     seed: int | None,
@@ -165,14 +110,14 @@ def verify(
     """
     if (only or output) and number is None:
         raise click.UsageError("--only and --output need --run N")
-    given = JobArguments(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
+    given = replace(given, seed=seed, until=until, no_pin=no_pin)
     history = history if number is None else None
     with (
         given.recorded(history, "verify") as record,
         tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name,
         handling_signals(),
     ):
-        job_of(words, launch, skip, overrides)  # report a broken job once, before the runs
+        given.job()  # report a broken job once, before the runs
         folder = Path(name)
         if number is not None:
             return _one_run(given, folder, number, perturbations, only, output)
