@@ -145,8 +145,8 @@ def record(
     _check_options(native, executor, domain, policy, replay, seed, last, processes=processes)
     loaded, named = given.overridden(seed, until, last).job()
     if no_pin:
-        guard = loaded.guard.model_copy(update={"pin": False})
-        loaded = loaded.model_copy(update={"guard": guard})
+        guard = loaded.guard.with_values(pin=False)
+        loaded = loaded.with_values(guard=guard)
     if native or not loaded.guard.pins:
         unpin()
     if print_job:
@@ -154,7 +154,7 @@ def record(
         return
     if given.program and not (quiet or as_json):
         tell(f"the job (--print-job before '--' prints it alone):\n{loaded.to_yaml()}", end="")
-        if not (loaded.stop.model_fields_set or loaded.bags or any(n.main for n in loaded.nodes)):
+        if not (loaded.stop.given_fields or loaded.bags or any(n.main for n in loaded.nodes)):
             tell("it lasts as long as its programs: --until 10 ends it after 10 s, Ctrl-C at once")
     path = output or default_output(named)
     _check_first(loaded, export_bag, force=force)
@@ -313,7 +313,7 @@ def _export(trace: Path, bag: Path, *, force: bool) -> None:
 
 
 def _say_if_it_has_no_end(job: Job) -> None:
-    if job.stop.model_fields_set or job.bags:
+    if job.stop.given_fields or job.bags:
         return
     if job.launch:
         _note("a launch file has no end: stop the run with --until T or Ctrl-C")

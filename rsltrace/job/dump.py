@@ -66,7 +66,7 @@ def _relative(job: JobFields, path: str) -> str:
 def plain_part(part: JobPart) -> dict[str, Any]:
     """Return a part of a job as a job file has it: every key that differs from its default."""
     values: dict[str, Any] = {}
-    for name, field in type(part).model_fields.items():
+    for name, field in type(part).fields.items():
         value = getattr(part, name)
         if field.exclude or value == field.get_default():
             continue
@@ -85,7 +85,7 @@ def _times(value: Any) -> Any:
 def _complete(part: JobPart) -> dict[str, Any]:
     values: dict[str, Any] = {}
     absent = part.absent if isinstance(part, NodeSpec) else ()
-    for name, field in type(part).model_fields.items():
+    for name, field in type(part).fields.items():
         if not field.exclude and name not in absent:
             values[name] = _json(plain_value(getattr(part, name), _complete))
     return values

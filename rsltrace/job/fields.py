@@ -125,7 +125,7 @@ def _executors(value: object) -> object:
 def _files_of(value: object, loc: Loc = ()) -> Iterator[tuple[Loc, str]]:
     """Yield (place, path) of every ``file`` in a part, however deep."""
     if isinstance(value, JobPart):
-        for name, field in type(value).model_fields.items():
+        for name, field in type(value).fields.items():
             inner = getattr(value, name)
             place = (*loc, field.alias or name)
             if name == "file" and inner is not None:

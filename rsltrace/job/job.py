@@ -131,7 +131,7 @@ def _bags_end(job: JobFields) -> Iterator[JobProblem]:
 
 def _something_to_run(job: JobFields) -> Iterator[JobProblem]:
     if not job.nodes and not job.bags and not job.launch:
-        place = ("nodes",) if "nodes" in job.model_fields_set else ()
+        place = ("nodes",) if "nodes" in job.given_fields else ()
         yield JobProblem(
             "a job needs at least one node (nodes:), launch file (launch:) or bag (bags:)",
             place,

@@ -134,7 +134,7 @@ class NativeRun:
 
     def _check_last(self) -> None:
         """Raise ``JobError`` if the run cannot keep its last seconds only."""
-        seen = self.job.stop.model_fields_set - _TIMES
+        seen = self.job.stop.given_fields - _TIMES
         if self.job.record.last is not None and seen:
             raise JobError(
                 "a run of which only the last seconds are kept is not looked at while it goes on: "

@@ -168,7 +168,7 @@ def priority_rules(job: Job, policy: str | None) -> tuple[PriorityRule, ...] | N
 
 def ignored(job: Job, policy: str | None = None) -> list[str]:
     """Return the keys of a job that have no effect natively, where priorities go by ``policy``."""
-    keys = [key.removesuffix("_ns") for key in _STEERING if key in job.model_fields_set]
+    keys = [key.removesuffix("_ns") for key in _STEERING if key in job.given_fields]
     if "policy" in keys and job.policy is not None and policy is not None:
         given = job.policy.order or ("priority" if job.policy.priority is not None else "")
         keys = [key for key in keys if key != "policy" or policy != given]

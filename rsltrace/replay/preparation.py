@@ -358,16 +358,14 @@ def job_of_native(trace: Trace, job: Job) -> Job:
         spec if any(getattr(spec, key) for key in _ONLY_OF_PROCESSES) else as_python(job, spec)
         for spec in job.nodes
     )
-    defaults = {key: Job.model_fields[key].get_default() for key in _OF_SIMULATIONS}
+    defaults = {key: Job.fields[key].get_default() for key in _OF_SIMULATIONS}
     lasted_ns = last_ns(trace) - trace.start_ns
-    return job.model_copy(
-        update={
-            **defaults,
-            "nodes": tuple(nodes),
-            "start_ns": trace.start_ns,
-            "policy": PolicySpec(recorded=os.path.relpath(trace.name, job.base_dir)),
-            "stop": StopSpec(duration_ns=lasted_ns),
-        }
+    return job.with_values(
+        **defaults,
+        nodes=tuple(nodes),
+        start_ns=trace.start_ns,
+        policy=PolicySpec(recorded=os.path.relpath(trace.name, job.base_dir)),
+        stop=StopSpec(duration_ns=lasted_ns),
     )
 
 

@@ -119,9 +119,9 @@ def replay_native(
     """
     job, topics = plan.job, set[str]()
     if nodes:
-        found = [node_topics(job.model_copy(update={"policy": None}), node) for node in nodes]
+        found = [node_topics(job.with_values(policy=None), node) for node in nodes]
         entries = sorted({one.entry for one in found})
-        job = job.model_copy(update={"nodes": tuple(job.nodes[entry] for entry in entries)})
+        job = job.with_values(nodes=tuple(job.nodes[entry] for entry in entries))
         own = {one.node for one in found}
         publishers = [e for e in plan.trace.entities.values() if e.kind is EntityKind.PUBLISHER]
         others = {e.name for e in publishers if plan.trace.node_of(e).name not in own}

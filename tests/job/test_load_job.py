@@ -81,7 +81,7 @@ def test_every_key_of_a_job_file_is_read(folder: Path) -> None:
           exclude: [/camera/*]
         """
     )
-    assert job.model_copy(update={"given_text": None}) == Job(
+    assert job.with_values(given_text=None) == Job(
         nodes=[
             NodeSpec(
                 node="my_nodes:Talker",

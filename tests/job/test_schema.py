@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 from rsltrace.job.documents.reference import reference, undocumented
 from rsltrace.job.documents.schema import field_schema, job_schema
 from rsltrace.job.job import Job
-from rsltrace.job.parts.field import Fielded, FieldInfo
+from rsltrace.job.parts.field import FrozenFields, PartField
 from rsltrace.job.parts.keys import file_fields, models_in
 from rsltrace.job.parts.part import checked
 from rsltrace.job.reading.compose import CompositionKeys
@@ -85,8 +85,8 @@ def test_what_the_loader_refuses_does_not_fit(text: str) -> None:
     assert problems(text) != []
 
 
-def fields() -> Iterator[tuple[str, FieldInfo]]:
-    models: list[type[Fielded]] = [Job, CompositionKeys]
+def fields() -> Iterator[tuple[str, PartField]]:
+    models: list[type[FrozenFields]] = [Job, CompositionKeys]
     for model in models:
         for key, field in file_fields(model):
             yield f"{model.__name__}.{key}", field
@@ -110,7 +110,7 @@ def test_examples_are_right(name: str) -> None:
 
 
 def test_every_key_is_checked() -> None:
-    unchecked = [name for name, field in FIELDS.items() if not field.metadata]
+    unchecked = [name for name, field in FIELDS.items() if not field.checks]
     assert [name for name in unchecked if not models_in(FIELDS[name].annotation)] == []
 
 

@@ -416,7 +416,7 @@ def test_a_virtual_environment_in_the_search_path_is_not_the_users_code(
 
 
 def test_every_key_of_stop_is_in_the_table() -> None:
-    assert set(STOP_RULES) == set(StopSpec.model_fields)
+    assert set(STOP_RULES) == set(StopSpec.fields)
 
 
 def test_a_rule_that_counts_messages_takes_one_class(

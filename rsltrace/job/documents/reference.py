@@ -16,7 +16,7 @@ from ruamel.yaml import YAML
 
 from rsltrace.job.documents.schema import field_schema, file_default, summary
 from rsltrace.job.job import Job
-from rsltrace.job.parts.field import Fielded, FieldInfo
+from rsltrace.job.parts.field import FrozenFields, PartField
 from rsltrace.job.parts.keys import attached, file_fields, models_in
 from rsltrace.job.reading.compose import CompositionKeys
 from rsltrace.job.values.times import TIME_SCHEMA
@@ -53,7 +53,7 @@ A type is named only where the example does not show it.
 def reference() -> str:
     """Return the text of ``docs/jobs.md``."""
     out = [_HEAD]
-    done: dict[type[Fielded], str] = {}
+    done: dict[type[FrozenFields], str] = {}
     out += _section("The job", None, [*file_fields(Job), *file_fields(CompositionKeys)], done)
     queue = list(_parts([*file_fields(Job)], ""))
     while queue:
@@ -70,7 +70,7 @@ def reference() -> str:
 def undocumented() -> list[str]:
     """Return the keys whose fields lack a description or an example."""
     missing, done = [], set()
-    queue: list[type[Fielded]] = [Job, CompositionKeys]
+    queue: list[type[FrozenFields]] = [Job, CompositionKeys]
     while queue:
         model = queue.pop()
         done.add(model)
@@ -81,7 +81,9 @@ def undocumented() -> list[str]:
     return missing
 
 
-def _parts(fields: list[tuple[str, FieldInfo]], path: str) -> Iterator[tuple[str, type[Fielded]]]:
+def _parts(
+    fields: list[tuple[str, PartField]], path: str
+) -> Iterator[tuple[str, type[FrozenFields]]]:
     for key, field in fields:
         inner = f"{path}.{key}" if path else key
         kind = field_schema(field).get("type")
@@ -95,9 +97,9 @@ def _parts(fields: list[tuple[str, FieldInfo]], path: str) -> Iterator[tuple[str
 
 def _section(
     title: str,
-    model: type[Fielded] | None,
-    fields: list[tuple[str, FieldInfo]],
-    done: dict[type[Fielded], str],
+    model: type[FrozenFields] | None,
+    fields: list[tuple[str, PartField]],
+    done: dict[type[FrozenFields], str],
 ) -> list[str]:
     """Return a section. Keys of a base class that has a section, in ``done``, are not repeated."""
     out = [f"## {title}", ""]
@@ -115,12 +117,12 @@ def _section(
     return [*out, ""] if fields else out
 
 
-def _extends(model: type[Fielded], other: type[Fielded]) -> bool:
+def _extends(model: type[FrozenFields], other: type[FrozenFields]) -> bool:
     """Whether a model has all keys of another, or only such keys."""
     return issubclass(model, other) or issubclass(other, model)
 
 
-def _entry(key: str, field: FieldInfo) -> list[str]:
+def _entry(key: str, field: PartField) -> list[str]:
     kind = _words(field_schema(field), field)
     values = [value for value in field.examples or () if not isinstance(value, (bool, int, float))]
     values = [value for value in values if f"`{flow(value)}`" not in kind]
@@ -143,7 +145,7 @@ def _wrapped(text: str, indent: str = "") -> str:
     )
 
 
-def _words(schema: dict[str, Any], field: FieldInfo | None = None) -> str:
+def _words(schema: dict[str, Any], field: PartField | None = None) -> str:
     """Return what a schema accepts, in a few words."""
     if field is not None and attached(field, "schema") is TIME_SCHEMA:
         return "time"

@@ -14,7 +14,7 @@ from itertools import combinations
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from rsltrace.job.job import Job
-from rsltrace.job.parts.field import Fielded, FieldInfo
+from rsltrace.job.parts.field import FrozenFields, PartField
 from rsltrace.job.parts.keys import attached, file_fields, model_of
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.reading.compose import CompositionKeys
@@ -60,12 +60,12 @@ def job_schema() -> Schema:
     }
 
 
-def field_schema(field: FieldInfo) -> Schema:
+def field_schema(field: PartField) -> Schema:
     """Return what a field accepts, with references to the definitions of its parts."""
     return _Maker({}, partial=False).field(field, bare=True)
 
 
-def file_default(field: FieldInfo) -> Any:
+def file_default(field: PartField) -> Any:
     """Return the default of a field as a job file would say it, or None."""
     if field.is_required():
         return None
@@ -90,7 +90,7 @@ class _Maker:
         self._definitions = definitions
         self._partial = partial
 
-    def reference(self, model: type[Fielded]) -> Schema:
+    def reference(self, model: type[FrozenFields]) -> Schema:
         """Return a reference to a part's definition, which is made if need be."""
         name = model.__name__.removesuffix("Spec") + ("Change" if self._partial else "")
         if name not in self._definitions:
@@ -98,7 +98,7 @@ class _Maker:
             self._definitions[name] = self._definition(model)
         return {"$ref": f"#/$defs/{name}"}
 
-    def _definition(self, model: type[Fielded]) -> Schema:
+    def _definition(self, model: type[FrozenFields]) -> Schema:
         fields = dict(file_fields(model))
         if model is Job:
             fields = {**dict(file_fields(CompositionKeys)), **fields}
@@ -124,9 +124,9 @@ class _Maker:
             definition["anyOf"] = [{"required": [key]} for key in needed]
         return definition
 
-    def field(self, field: FieldInfo, *, bare: bool = False) -> Schema:
+    def field(self, field: PartField, *, bare: bool = False) -> Schema:
         """Return the schema of a key's value; ``bare`` without what only a file may say."""
-        schema = self._of(field.annotation, field.metadata)
+        schema = self._of(field.annotation, field.checks)
         if bare:
             return schema
         whole = _substitutable(schema)
@@ -204,11 +204,11 @@ class _Maker:
         if shorthand is None:
             return reference
         field = next(field for key, field in file_fields(model) if key == shorthand)
-        short = self._of(field.annotation, field.metadata)
+        short = self._of(field.annotation, field.checks)
         return {"anyOf": [reference, *_options(short)]}
 
 
-def summary(model: type[Fielded]) -> str:
+def summary(model: type[FrozenFields]) -> str:
     """Return the first paragraph of a model's docstring."""
     return " ".join(inspect.cleandoc(model.__doc__ or "").split("\n\n")[0].split())
 

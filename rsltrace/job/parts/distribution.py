@@ -85,7 +85,7 @@ class _ByMeanSpec(JobPart):
     @after_fields
     def _one_way(self) -> None:
         one, other = self.ALTERNATIVES
-        fields = type(self).model_fields.items()
+        fields = type(self).fields.items()
         given = {field.alias or name for name, field in fields if getattr(self, name) is not None}
         if given not in (set(one), set(other)):
             raise JobProblem(f"give either {' and '.join(one)}, or {' and '.join(other)}")

@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 _NONE: Any = object()
 
 
-class FieldInfo:
+class PartField:
     """What a part says about one of its keys. An attribute of the part's class."""
 
     annotation: Any
     """The type of the checked value."""
-    metadata: tuple[Callable[[object, bool], object], ...]
+    checks: tuple[Callable[[object, bool], object], ...]
     """Checks: from what is given, and whether a file gives it, to the value."""
 
     def __init__(
@@ -47,51 +47,51 @@ class FieldInfo:
         return self._default if self._default_factory is None else self._default_factory()
 
 
-Field: Callable[..., Any] = FieldInfo
+Field: Callable[..., Any] = PartField
 """Makes a key, which type checkers take for its value."""
 
 
 class _Fields:
     """The fields of a class by name, those of its base classes first; found when first used."""
 
-    def __get__(self, part: object, cls: type[Fielded]) -> dict[str, FieldInfo]:
+    def __get__(self, part: object, cls: type[FrozenFields]) -> dict[str, PartField]:
         if "_fields" not in vars(cls):
             cls._fields = dict(_fields(cls))
         return cls._fields
 
 
-def _fields(cls: type) -> Iterator[tuple[str, FieldInfo]]:
+def _fields(cls: type) -> Iterator[tuple[str, PartField]]:
     hints = get_type_hints(cls, include_extras=True)
     for base in reversed(cls.__mro__):
         for name, field in vars(base).items():
-            if isinstance(field, FieldInfo):
+            if isinstance(field, PartField):
                 is_checked = get_origin(hints[name]) is Annotated
                 field.annotation, *checks = get_args(hints[name]) if is_checked else [hints[name]]
-                field.metadata = tuple(checks)
+                field.checks = tuple(checks)
                 yield name, field
 
 
-class Fielded:
+class FrozenFields:
     """Has a value for each of its fields, and cannot be changed."""
 
-    model_fields: ClassVar[Mapping[str, FieldInfo]] = _Fields()  # type: ignore[assignment]
-    _fields: ClassVar[dict[str, FieldInfo]]
+    fields: ClassVar[Mapping[str, PartField]] = _Fields()  # type: ignore[assignment]
+    _fields: ClassVar[dict[str, PartField]]
     _given: frozenset[str]
 
     @property
-    def model_fields_set(self) -> set[str]:
+    def given_fields(self) -> set[str]:
         """The fields whose values were given."""
         return set(self._given)
 
-    def model_copy(self, *, update: Mapping[str, Any]) -> Self:
+    def with_values(self, **changes: Any) -> Self:
         """Return a copy with other values of some fields, which are not checked."""
         made = object.__new__(type(self))
-        given = self._given | update.keys()
-        vars(made).update({**vars(self), **update, "_given": given})
+        given = self._given | changes.keys()
+        vars(made).update({**vars(self), **changes, "_given": given})
         return made
 
     def _values(self) -> list[Any]:
-        return [getattr(self, name) for name in self.model_fields]
+        return [getattr(self, name) for name in self.fields]
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"{name}: a {type(self).__name__} is frozen")
@@ -107,5 +107,5 @@ class Fielded:
         return hash((type(self), *self._values()))
 
     def __repr__(self) -> str:
-        shown = (name for name, field in self.model_fields.items() if field.repr)
+        shown = (name for name, field in self.fields.items() if field.repr)
         return f"{type(self).__name__}({', '.join(f'{n}={getattr(self, n)!r}' for n in shown)})"

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from typing import Any, ClassVar, get_args, get_origin
 
-from rsltrace.job.parts.field import Fielded, FieldInfo
+from rsltrace.job.parts.field import FrozenFields, PartField
 from rsltrace.job.values.problem import Loc
 
 
@@ -16,8 +16,8 @@ class LaterPart:
     HOME: ClassVar[str]
 
     @classmethod
-    def model(cls) -> type[Fielded]:
-        found: type[Fielded] = getattr(import_module(cls.HOME), cls.__name__)
+    def model(cls) -> type[FrozenFields]:
+        found: type[FrozenFields] = getattr(import_module(cls.HOME), cls.__name__)
         return found
 
 
@@ -26,23 +26,23 @@ def later(home: str, *names: str) -> dict[str, type[LaterPart]]:
     return {name: type(name, (LaterPart,), {"HOME": home}) for name in names}
 
 
-def model_of(annotation: Any) -> type[Fielded] | None:
+def model_of(annotation: Any) -> type[FrozenFields] | None:
     """Return the model that an annotation is, if it is one."""
     if not isinstance(annotation, type) or get_args(annotation):
         return None  # in Python 3.10 tuple[X, ...] calls itself a type
     if issubclass(annotation, LaterPart):
         return annotation.model()
-    return annotation if issubclass(annotation, Fielded) else None
+    return annotation if issubclass(annotation, FrozenFields) else None
 
 
-def file_fields(model: type[Fielded]) -> Iterator[tuple[str, FieldInfo]]:
+def file_fields(model: type[FrozenFields]) -> Iterator[tuple[str, PartField]]:
     """Yield (key in a job file, field) of a model, in order."""
-    for name, field in model.model_fields.items():
+    for name, field in model.fields.items():
         if not field.exclude:
             yield field.alias or name, field
 
 
-def models_in(annotation: Any) -> list[type[Fielded]]:
+def models_in(annotation: Any) -> list[type[FrozenFields]]:
     """Return the models that values of an annotation may be made of."""
     if inner := get_args(annotation):
         return [found for argument in inner for found in models_in(argument)]
@@ -50,7 +50,7 @@ def models_in(annotation: Any) -> list[type[Fielded]]:
     return [] if model is None else [model]
 
 
-def keys_with(model: type[Fielded], key: str) -> list[str]:
+def keys_with(model: type[FrozenFields], key: str) -> list[str]:
     """Return the keys of a model whose parts have a key of that name."""
     return [
         own
@@ -59,7 +59,7 @@ def keys_with(model: type[Fielded], key: str) -> list[str]:
     ]
 
 
-def field_at(model: type[Fielded], loc: Loc) -> FieldInfo | None:
+def field_at(model: type[FrozenFields], loc: Loc) -> PartField | None:
     """Return the field that governs the value at ``loc``, or None below free-form values."""
     models, found = [model], None
     in_mapping = False
@@ -77,7 +77,7 @@ def field_at(model: type[Fielded], loc: Loc) -> FieldInfo | None:
     return found
 
 
-def alternatives_at(model: type[Fielded], loc: Loc) -> tuple[tuple[str, ...], ...]:
+def alternatives_at(model: type[FrozenFields], loc: Loc) -> tuple[tuple[str, ...], ...]:
     """Return the sets of keys of the value at ``loc`` of which only one may be given."""
     field = field_at(model, loc) if loc else None
     models = [] if field is None else models_in(field.annotation)
@@ -85,7 +85,7 @@ def alternatives_at(model: type[Fielded], loc: Loc) -> tuple[tuple[str, ...], ..
 
 
 def without_alternatives(
-    values: dict[Any, Any], keys: Iterable[Any], model: type[Fielded], loc: Loc
+    values: dict[Any, Any], keys: Iterable[Any], model: type[FrozenFields], loc: Loc
 ) -> dict[Any, Any]:
     """Return ``values`` without what cannot stay beside the new ``keys``: another distribution
     takes the place of the one that was there."""
@@ -96,7 +96,7 @@ def without_alternatives(
     return {key: value for key, value in values.items() if key not in gone}
 
 
-def is_list_at(model: type[Fielded], loc: Loc) -> bool:
+def is_list_at(model: type[FrozenFields], loc: Loc) -> bool:
     """Say whether the value at ``loc`` is a list and nothing else."""
     field = field_at(model, loc) if loc else None
     if field is None or field is field_at(model, loc[:-1]):
@@ -105,16 +105,16 @@ def is_list_at(model: type[Fielded], loc: Loc) -> bool:
     return get_origin(field.annotation) is tuple or bool(kinds)
 
 
-def attached(field: FieldInfo, name: str) -> Any:
+def attached(field: PartField, name: str) -> Any:
     """Return what a field's check says about itself under ``name``, or None."""
-    for item in field.metadata:
+    for item in field.checks:
         value = getattr(item, name, None)
         if value is not None:
             return value
     return None
 
 
-def shorthand_at(model: type[Fielded], loc: Loc) -> str | None:
+def shorthand_at(model: type[FrozenFields], loc: Loc) -> str | None:
     """Return the key that text alone stands for at ``loc``, if it does."""
     field = field_at(model, loc)
     if field is None or not loc:

@@ -82,7 +82,7 @@ class StartAfterSpec(JobPart):
 
     @after_fields
     def _says_something(self) -> None:
-        if not self.model_fields_set:
+        if not self.given_fields:
             raise JobProblem(f"give one of delay, {', '.join(self.CONDITIONS)}")
 
 

@@ -13,7 +13,7 @@ from types import UnionType
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, Union, get_args, get_origin
 
 from rsltrace.errors import JobError, nearest
-from rsltrace.job.parts.field import Fielded, FieldInfo
+from rsltrace.job.parts.field import FrozenFields, PartField
 from rsltrace.job.parts.keys import file_fields, model_of, models_in
 from rsltrace.job.values.problem import (
     JobProblem,
@@ -79,12 +79,12 @@ def _written(value: object) -> str:
 
 
 def checked(
-    field: FieldInfo, given: object, found: list[JobProblem], loc: Loc, *, in_file: bool
+    field: PartField, given: object, found: list[JobProblem], loc: Loc, *, in_file: bool
 ) -> Any:
     """Return the value of a field, or add to ``found`` what is wrong with what is given."""
     value = given
     try:
-        for check in field.metadata:
+        for check in field.checks:
             value = check(value, in_file)
     except ValueError as error:
         found += _worded(error, given, loc)
@@ -116,7 +116,7 @@ def _with_parts(
     )
 
 
-class JobPart(Fielded):
+class JobPart(FrozenFields):
     """Base of a job and its parts. Built wrongly, it raises ``JobError``."""
 
     OF_TIMES: ClassVar[tuple[str, ...]] = ()
@@ -165,7 +165,7 @@ class JobPart(Fielded):
         except JobProblem as problem:
             found += _worded(problem, data, loc)
             return
-        fields = {field.alias or name: (name, field) for name, field in self.model_fields.items()}
+        fields = {field.alias or name: (name, field) for name, field in self.fields.items()}
         unknown = [key for key in given if key not in fields]
         names = [key for key, _ in file_fields(type(self))] if unknown else []
         # A misspelt key is one mistake, not two: the key that it was meant to be is not missing.
@@ -192,7 +192,7 @@ class JobPart(Fielded):
 
     @classmethod
     def _with_keys_of_times(cls, data: dict[Any, Any]) -> dict[Any, Any]:
-        for name, field in cls.model_fields.items():
+        for name, field in cls.fields.items():
             key = field.alias
             if key is not None and name.endswith("_ns") and name in data:
                 if key in data:
@@ -212,7 +212,7 @@ class JobPart(Fielded):
     def replace(self, **changes: object) -> Self:
         """Return a copy with ``changes`` (keys as in the constructor), validated again."""
         values: dict[str, object] = {}
-        for name, field in type(self).model_fields.items():
+        for name, field in type(self).fields.items():
             key = field.alias or name
             if key not in changes and name not in changes and name in self._given:
                 value = getattr(self, name)

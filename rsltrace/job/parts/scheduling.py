@@ -248,7 +248,7 @@ class ThreadsSpec(JobPart):
 def policy_named(value: str) -> dict[str, str]:
     """Return what a word stands for: ``{order: word}``."""
     if value in PolicySpec.ONE_OF:
-        example = PolicySpec.model_fields[value].examples or [None]
+        example = PolicySpec.fields[value].examples or [None]
         shown = json.dumps({value: example[0]}).replace('"', "")
         raise JobProblem(f"{value!r} alone does not say enough; write for example {shown}")
     if value not in ORDERS:

@@ -29,7 +29,7 @@ def job_from_resolved(
 
     :raises JobError: if it is no job of this version.
     """
-    values = {key: value for key, value in resolved.items() if key in Job.model_fields}
+    values = {key: value for key, value in resolved.items() if key in Job.fields}
     unknown = {key: value for key, value in resolved.items() if key not in values}
     guard = _guard(values.get("guard"))
     nodes = [
@@ -49,7 +49,7 @@ def _given(part: type[JobPart], value: Any) -> Any:
         return value
     found: dict[str, Any] = {}
     for name, inner in value.items():
-        field = part.model_fields.get(name)
+        field = part.fields.get(name)
         if field is None or inner is None:
             if inner is not None:
                 found[name] = inner  # unknown here: the models say so
@@ -72,7 +72,7 @@ def _parts(models: list[type[JobPart]], value: Any) -> Any:
     if not isinstance(value, dict):
         return value
     for model in models:
-        if set(value) <= set(model.model_fields):
+        if set(value) <= set(model.fields):
             return _given(model, value)
     return {key: _parts(models, item) for key, item in value.items()}
 

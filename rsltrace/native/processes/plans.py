@@ -34,7 +34,7 @@ def starts_of(job: Job, like: EntryOrder, note: Callable[[str], None]) -> list[P
     :raises JobError: a program, or the folder that it is to run in, is not there.
     """
     processes = ProcessPrograms(job, lambda text: None)
-    observed = job.model_copy(update={"nodes": tuple(as_python(job, one) for one in job.nodes)})
+    observed = job.with_values(nodes=tuple(as_python(job, one) for one in job.nodes))
     like = replace(like, job=observed, module_path=tuple(sys.path))
     starts = []
     observer = cache(lambda: _observer(note))  # built for the first program

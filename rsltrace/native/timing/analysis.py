@@ -99,7 +99,7 @@ def with_times(job: Job, times: Mapping[CallbackKey, int]) -> Job:
         EntityExecutionSpec(node=node, entity=entity, constant=f"{time_ns}ns")
         for (node, entity), time_ns in longest.items()
     )
-    return job.model_copy(update={"execution": ExecutionSpec(entities=entities)})
+    return job.with_values(execution=ExecutionSpec(entities=entities))
 
 
 def analyze(

@@ -130,11 +130,11 @@ def replay_from_bag(
     :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
     :raises RunError: the node failed.
     """
-    alone = job.model_copy(update=_NOT_OF_ROBOTS)
+    alone = job.with_values(**_NOT_OF_ROBOTS)
     ends = node_topics(alone, node)
     specs = tuple(_specs(bags, ends))
     nodes = (job.nodes[ends.entry],)
-    job = alone.model_copy(update={"nodes": nodes, "bags": specs})
+    job = alone.with_values(nodes=nodes, bags=specs)
     with to.place() as path:
         done = run(job, path, force=to.force, echo=to.echo, observer=to.observer)
         if done.error is not None:

@@ -50,7 +50,7 @@ def as_python(job: Job, spec: NodeSpec) -> NodeSpec:
         path = job.resolve(spec.program)
         if path.is_file() and is_python(path):
             changes |= {"program": None, "script": spec.program}
-    return spec.model_copy(update=changes)
+    return spec.with_values(**changes)
 
 
 def ros_words(arguments: Sequence[RosArguments]) -> list[str]:
