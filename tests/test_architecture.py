@@ -304,7 +304,7 @@ RUNS_CODE = {
     "rsltrace/run/plans/scheduling.py": "import_module",  # node: module:Class
     "rsltrace/child_processes.py": "runpy",  # a command of ours, in a process
     # Python launch files are programs; they are read in a process of their own.
-    "rsltrace/adapters/launch/api/ros_modules.py": "import_module",  # modules of launch
+    "rsltrace/adapters/launch/python_file.py": "import_module",  # modules of launch
     "rsltrace/adapters/launch/api/substitutions.py": "eval import_module",  # PythonExpression
     "rsltrace/adapters/launch/api/description_sources.py": "exec_module",  # a Python launch file
     "rsltrace/adapters/launch/expand.py": "pickle",  # the answer of that process

@@ -62,8 +62,7 @@ def history(
     a file, or a folder or address (s3://…) with a file for each run. Lines of several are read
     together. A job's digest is compared with that of its run before on the same branch.
     """
-    from rsltrace.search.history.summary import summarize
-    from rsltrace.search.history.words import as_text
+    from rsltrace.search.history.summary import as_text, summarize
 
     if output is not None:
         check_not_input(output, [Path(one) for one in places if "://" not in one], "history")

@@ -18,7 +18,7 @@ from typing import Any, cast
 import pytest
 
 from rsltrace.child_processes import Done
-from rsltrace.cli.output import verify_text
+from rsltrace.cli import verify as verify_command
 from rsltrace.search import perturb
 from rsltrace.search.perturb import KINDS, Perturbation, PerturbedRun, perturbation, perturbed_run
 from rsltrace.search.verify import DeterminismTest, VerifyResult
@@ -53,10 +53,10 @@ def test_a_core_type_that_the_user_has_chosen_is_left_alone(
 
 def test_of_a_core_type_that_makes_a_difference_the_way_out_is_named() -> None:
     found = VerifyResult(cast(Any, None), 2, (), (), narrowed=True, provoked_by=(perturb.KERNEL,))
-    told = verify_text._provoked(found, "rsltrace verify job.yaml --run 1")
+    told = verify_command._provoked(found, "rsltrace verify job.yaml --run 1")
     assert "OPENBLAS_CORETYPE=Haswell rsltrace" in told
     other = replace(found, provoked_by=(perturb.HEAP,))
-    assert "CORETYPE" not in verify_text._provoked(other, "rsltrace verify job.yaml --run 1")
+    assert "CORETYPE" not in verify_command._provoked(other, "rsltrace verify job.yaml --run 1")
 
 
 @pytest.mark.long

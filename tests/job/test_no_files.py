@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from rsltrace.adapters.launch.api.parameters import parameters_for
 from rsltrace.adapters.launch.expand import expand
-from rsltrace.adapters.launch.parameter_files import parameters_for
 from rsltrace.errors import JobError
 from rsltrace.guard.audit.audit import audit_path
 from rsltrace.job import job_from_text, load_job

@@ -17,6 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from rsltrace.adapters.launch.api.parameters import parameters_for
 from rsltrace.adapters.launch.model import (
     ENVIRONMENT,
     LaunchArgument,
@@ -31,7 +32,6 @@ from rsltrace.adapters.launch.model import (
     respawning,
     yaml_value,
 )
-from rsltrace.adapters.launch.parameter_files import parameters_for
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import parse_time
 

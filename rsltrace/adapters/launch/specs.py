@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
+from rsltrace.adapters.launch.api.parameters import flat, parameters_for
 from rsltrace.adapters.launch.model import (
     LaunchedNode,
     LaunchResult,
@@ -16,7 +17,6 @@ from rsltrace.adapters.launch.model import (
     full_name,
     inferred,
 )
-from rsltrace.adapters.launch.parameter_files import flat, parameters_for
 from rsltrace.adapters.workspace.cache import lasting
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from rsltrace.search.history.summary import CommitResult, HistorySummary
-from rsltrace.search.history.words import (
+from rsltrace.search.history.summary import (
+    CommitResult,
+    HistorySummary,
     bisect_command,
     change_cells,
     commit_text,
