@@ -115,7 +115,8 @@ class Done:
 
 
 class Processes:
-    """Starts processes, each in a session of its own, from several threads; ``kill`` ends all."""
+    """Starts processes, each in a session of its own, from several threads; ``kill``, or leaving
+    its ``with`` block, ends all."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -179,6 +180,12 @@ class Processes:
             process.communicate()
             with self._lock:
                 self._running.discard(process)
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
 
     def kill(self) -> None:
         """End everything that runs, and start nothing more."""

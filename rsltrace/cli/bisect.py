@@ -131,18 +131,16 @@ def bisect(
         runner = RevisionRunner(
             repository, tree, tuple(given.arguments(tree.path)), processes, timeout
         )
-        try:
-            search = BisectSearch(
-                runner,
-                *ends,
-                check,
-                first_parent=first_parent,
-                on_try=lambda tried: say_progress(line_of(tried)),
-                on_note=say_progress,
-            )
+        search = BisectSearch(
+            runner,
+            *ends,
+            check,
+            first_parent=first_parent,
+            on_try=lambda tried: say_progress(line_of(tried)),
+            on_note=say_progress,
+        )
+        with processes:
             found = search.find()
-        finally:
-            processes.kill()
         return _report(found, runner, output, as_json=as_json)
 
 

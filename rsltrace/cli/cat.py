@@ -37,6 +37,10 @@ from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.kinds import flag_names
 from rsltrace.trace.words.logs import log_record
 
+if TYPE_CHECKING:
+    from rsltrace.conditions.trace_events import TraceCondition
+    from rsltrace.job.values.times import TimeInRun
+
 _WITH_MESSAGE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG)
 _WITH_PLACE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.LOG)
 
@@ -197,16 +201,7 @@ def _hex(value: int) -> str:
     return f"{value:016x}" if value else "-"
 
 
-if TYPE_CHECKING:
-    from rsltrace.conditions.trace_events import TraceCondition
-    from rsltrace.job.values.times import TimeInRun
-
-    _TimeParam = click.ParamType[TimeInRun]
-else:
-    _TimeParam = click.ParamType  # not generic before click 8.2
-
-
-class RunTimeParam(_TimeParam):
+class RunTimeParam(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
     """A time of the run, or a simulated time after ``@``."""
 
     name = "time"

@@ -32,13 +32,7 @@ _PROMPTS = 3
 _ASCII = str.maketrans({"└": "`-", "…": "...", "→": "->", "≠": "!=", "↓": "v", "↑": "^"})
 
 
-if TYPE_CHECKING:
-    _Type = click.ParamType[tuple[str, float]]
-else:
-    _Type = click.ParamType  # older versions of click know no types here
-
-
-class Tolerance(_Type):
+class Tolerance(click.ParamType):  # type: ignore[type-arg]  # not generic before click 8.2
     """``FIELD=TOL``: a glob of fields and a number."""
 
     name = "tolerance"

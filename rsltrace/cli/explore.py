@@ -438,8 +438,9 @@ class _SearchReport:
         from rsltrace_viewer.pages.search_page import exploration_page
 
         from rsltrace.cli.output.search_text import flaky_lines, search_lines
-        from rsltrace.search.explore.report.exploration import Exploration, ReducedRun
-        from rsltrace.search.explore.report.formats import (
+        from rsltrace.search.explore.report import (
+            Exploration,
+            ReducedRun,
             github_text,
             json_text,
             junit_text,

@@ -27,7 +27,7 @@ from rsltrace.debug.checkpoints import Breakpoint, RunPosition, StopReport, posi
 from rsltrace.errors import DebugError, EditError, OutputError, RsltraceError
 from rsltrace.line_protocol import Lines, Message
 from rsltrace.replay.edits import parse_edit
-from rsltrace.trace.model.regular_file import not_replaceable
+from rsltrace.trace.model.regular_file import not_replaceable, replacement_of
 from rsltrace.trace.model.texts import Stamp
 
 # Branches of a debugging session: its run, repeated with edits.
@@ -99,12 +99,10 @@ class EditBranches:
             raise OutputError(f"{place} is {kind}; name a file, or remove it")
         if place.exists() and not force:
             raise OutputError(f"{place} exists; force=True replaces it")
-        part = place.with_name(f".{place.name}.{os.getpid()}")
         try:
-            shutil.copyfile(self.path, part)
-            part.replace(place)
+            with replacement_of(place) as work:
+                shutil.copyfile(self.path, work)
         except OSError as error:
-            part.unlink(missing_ok=True)
             raise OutputError(f"{place} cannot be written: {error.strerror}") from error
         return place
 

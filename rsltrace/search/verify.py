@@ -98,7 +98,7 @@ class DeterminismTest:
     def verify(self, runs: int, on_run: OnRun = lambda recorded: None) -> VerifyResult:
         """Record ``runs`` times, until two runs differ or one does not finish."""
         begin = time.monotonic()
-        with self._ending():
+        with self._processes:
             first = self._record(perturbation(0))
             on_run(first)
             took_s = time.monotonic() - begin
@@ -148,13 +148,6 @@ class DeterminismTest:
         differ = one.digest and two.digest and one.digest != two.digest
         hidden = HiddenDifference(node, attribute, event, other, (one, two) if differ else None)
         return replace(narrowed, other=None, hidden=hidden)
-
-    @contextmanager
-    def _ending(self) -> Iterator[None]:
-        try:
-            yield
-        finally:
-            self._processes.kill()
 
     def _record(self, around: Perturbation) -> PerturbedRun:
         return record_perturbed(

@@ -56,10 +56,9 @@ from rsltrace.trace.format import (
     TOPIC_TIMINGS,
 )
 from rsltrace.trace.index import metadata_checksum
-from rsltrace.trace.mcap.buffered_writer import BufferedWriter
 from rsltrace.trace.mcap.chunk_builder import joined, messages_chunk
 from rsltrace.trace.mcap.records import MESSAGE, MESSAGE_BYTES_MAX, MESSAGE_HEAD, RECORD_HEAD
-from rsltrace.trace.mcap.writer import McapWriter
+from rsltrace.trace.mcap.writer import BufferedWriter, McapWriter
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, OutputKind
 from rsltrace.trace.model.finding import Finding

@@ -12,15 +12,17 @@ from xml.etree import ElementTree
 import pytest
 from rsltrace_viewer.pages.search_page import exploration_page
 
-from rsltrace.search.explore.report.exploration import (
+from rsltrace.search.explore.report import (
     FAILS,
     Exploration,
     ReducedRun,
     causes,
     effects,
+    github_text,
+    json_values,
+    junit_text,
     repeat_command,
 )
-from rsltrace.search.explore.report.formats import github_text, json_values, junit_text
 from rsltrace.search.explore.trial import CHECK, EXCEPTION, Failure, JobSource, Trial, TrialResult
 
 LATE = Failure(CHECK, "it is <late> & wrong\x1b[2J", "never /late", 41)
@@ -208,7 +210,7 @@ def test_a_command_that_nobody_can_read_is_not_shown() -> None:
 
 def test_a_table_can_be_queried_and_merged_with_another(tmp_path: Path) -> None:
     duckdb = pytest.importorskip("duckdb")
-    from rsltrace.search.explore.report.formats import write_parquet
+    from rsltrace.search.explore.report import write_parquet
 
     for name in "ab":
         (tmp_path / name).mkdir()

@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 from ruamel.yaml import YAML
 
-from rsltrace.job.documents.reference import reference, undocumented
+from rsltrace.job.documents.reference import reference
 from rsltrace.job.documents.schema import field_schema, job_schema
 from rsltrace.job.job import Job
 from rsltrace.job.parts.field import FrozenFields, PartField
@@ -115,7 +115,8 @@ def test_every_key_is_checked() -> None:
 
 
 def test_every_key_is_described_and_has_an_example() -> None:
-    assert undocumented() == []
+    missing = [name for name, field in FIELDS.items() if not (field.description and field.examples)]
+    assert missing == []
 
 
 def test_the_documentation_is_up_to_date() -> None:

@@ -67,20 +67,6 @@ def reference() -> str:
     return "\n".join(out).rstrip() + "\n"
 
 
-def undocumented() -> list[str]:
-    """Return the keys whose fields lack a description or an example."""
-    missing, done = [], set()
-    queue: list[type[FrozenFields]] = [Job, CompositionKeys]
-    while queue:
-        model = queue.pop()
-        done.add(model)
-        for key, field in file_fields(model):
-            if not field.description or not field.examples:
-                missing.append(f"{model.__name__}.{key}")
-            queue += [inner for inner in models_in(field.annotation) if inner not in done]
-    return missing
-
-
 def _parts(
     fields: list[tuple[str, PartField]], path: str
 ) -> Iterator[tuple[str, type[FrozenFields]]]:

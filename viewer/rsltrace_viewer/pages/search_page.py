@@ -13,7 +13,7 @@ from markupsafe import Markup
 from rsltrace.diff import diff_files
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ExploreError
-from rsltrace.search.explore.report.exploration import (
+from rsltrace.search.explore.report import (
     FAILS,
     Exploration,
     FailureCause,
