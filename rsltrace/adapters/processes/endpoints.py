@@ -9,10 +9,7 @@ from rsltrace.adapters.processes.wire import WakeReason, changed_item, gid_of, p
 from rsltrace.errors import RunError
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.interface import MessageType, ServiceType
-from rsltrace.simulation.middleware.participant import Participant
-from rsltrace.simulation.middleware.publisher import Publisher, Transport
-from rsltrace.simulation.middleware.qos.policies import Qos
+from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.simulation.middleware.services import (
     CLIENT,
     SERVICE,
@@ -89,6 +86,12 @@ class QueueEndpoint(Receiver):
     event_kind: int
     _begun: tuple[Any, bytes] | None = None
     """The arrival with which its process has begun, and how that was packed."""
+
+    def __init__(self, process: HostProcess, number: int, *arguments: Any) -> None:
+        """``arguments`` are those of the kind of endpoint."""
+        super().__init__(*arguments)
+        self.process = process
+        self.number = number
 
     def dispatch(self) -> None:
         if not self.may_run():
@@ -175,20 +178,7 @@ class ProcessSubscription(_CallbackEndpoint, Subscription):
     """A subscription of a process."""
 
     event_kind = SUBSCRIPTION
-
-    def __init__(
-        self,
-        process: HostProcess,
-        number: int,
-        node: Participant,
-        topic: str,
-        type: MessageType,
-        qos: Qos,
-    ) -> None:
-        super().__init__(process.dispatcher, node, topic, type, qos)
-        self.process = process
-        self.number = number
-        self._received = 0
+    _received = 0
 
     def arriving_type(self) -> str:
         return self.type_name
@@ -209,19 +199,8 @@ class ProcessService(_CallbackEndpoint, Service):
 
     event_kind = SERVICE
 
-    def __init__(
-        self,
-        process: HostProcess,
-        number: int,
-        transport: Transport,
-        node: Participant,
-        name: str,
-        type: ServiceType,
-        qos: Qos,
-    ) -> None:
-        super().__init__(transport, node, name, type, qos)
-        self.process = process
-        self.number = number
+    def __init__(self, process: HostProcess, number: int, *arguments: Any) -> None:
+        super().__init__(process, number, *arguments)
         self._asked: dict[tuple[bytes, int], RequestId] = {}
 
     def packed(self, exchange: Exchange) -> bytes:
@@ -244,20 +223,6 @@ class ProcessClient(QueueEndpoint, Client):
     """A client of a process."""
 
     event_kind = CLIENT
-
-    def __init__(
-        self,
-        process: HostProcess,
-        number: int,
-        transport: Transport,
-        node: Participant,
-        name: str,
-        type: ServiceType,
-        qos: Qos,
-    ) -> None:
-        super().__init__(transport, node, name, type, qos)
-        self.process = process
-        self.number = number
 
     def packed(self, exchange: Exchange) -> bytes:
         return _packed_exchange(exchange, gid_of(self.entity_id))

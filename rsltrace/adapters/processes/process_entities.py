@@ -263,7 +263,9 @@ class ProcessEntities(dict[int, Any]):
         graph = self._adapter.domain.graph
         settled = graph.settled_request(topic, qos)
         type = self._adapter.message_type(type_name)
-        end = ProcessSubscription(self._process, number, node, topic, type, settled)
+        end = ProcessSubscription(
+            self._process, number, self._process.dispatcher, node, topic, type, settled
+        )
         self[number] = end
         graph.add_subscription(end)
 

@@ -28,21 +28,8 @@ _NAMED_MAX = 3
 
 def silent_topics(entities: Iterable[Entity]) -> str:
     """Return ``nobody publishes /scan, which /follower listens to``, "" if all are published."""
-    nodes: dict[int, str] = {}
-    published: set[str] = set()
-    heard: dict[str, dict[str, None]] = {}
-    for entity in entities:
-        if entity.kind is EntityKind.NODE:
-            nodes[entity.id] = entity.name
-        elif entity.kind is EntityKind.PUBLISHER:
-            published.add(entity.name)
-        elif entity.kind is EntityKind.SUBSCRIPTION:
-            heard.setdefault(entity.name, {})[nodes.get(entity.node, "a program")] = None
-    silent = [
-        (topic, listeners)
-        for topic, listeners in heard.items()
-        if topic not in published and topic not in _STANDARD and _HIDDEN not in topic
-    ]
+    wanted = _wanted(entities, EntityKind.SUBSCRIPTION, EntityKind.PUBLISHER)
+    silent = [(topic, nodes) for topic, nodes in wanted if topic not in _STANDARD]
     if not silent:
         return ""
     if len(silent) == 1:
@@ -64,22 +51,7 @@ def unheard_topics(entities: Sequence[Entity], player: str) -> str:
 
 def missing_servers(entities: Iterable[Entity]) -> str:
     """Return ``nobody serves /reset, of which /panel is a client``, "" if there is none."""
-    nodes: dict[int, str] = {}
-    served: set[str] = set()
-    called: dict[str, dict[str, None]] = {}
-    for entity in entities:
-        name = entity.name.partition("/_action/")[0]
-        if entity.kind is EntityKind.NODE:
-            nodes[entity.id] = name
-        elif entity.kind is EntityKind.SERVICE:
-            served.add(name)
-        elif entity.kind is EntityKind.CLIENT:
-            called.setdefault(name, {})[nodes.get(entity.node, "a program")] = None
-    missing = [
-        (name, clients)
-        for name, clients in called.items()
-        if name not in served and _HIDDEN not in name
-    ]
+    missing = _wanted(entities, EntityKind.CLIENT, EntityKind.SERVICE)
     if not missing:
         return ""
     if len(missing) == 1:
@@ -87,6 +59,26 @@ def missing_servers(entities: Iterable[Entity]) -> str:
         verb = "are clients" if len(clients) > 1 else "is a client"
         return f"nobody serves {printable(name)}, of which {_and(list(clients))} {verb}"
     return f"services without a server: {_names_text(missing, 'services')}"
+
+
+def _wanted(
+    entities: Iterable[Entity], wants: EntityKind, gives: EntityKind
+) -> list[tuple[str, dict[str, None]]]:
+    """Return the names that some entities want and none gives, with the nodes that want them."""
+    nodes: dict[int, str] = {}
+    given: set[str] = set()
+    wanted: dict[str, dict[str, None]] = {}
+    for entity in entities:
+        name = entity.name
+        if wants is EntityKind.CLIENT:  # those of an action are named by it
+            name = name.partition("/_action/")[0]
+        if entity.kind is EntityKind.NODE:
+            nodes[entity.id] = name
+        elif entity.kind is gives:
+            given.add(name)
+        elif entity.kind is wants:
+            wanted.setdefault(name, {})[nodes.get(entity.node, "a program")] = None
+    return [one for one in wanted.items() if one[0] not in given and _HIDDEN not in one[0]]
 
 
 def _names_text(found: list[tuple[str, dict[str, None]]], what: str) -> str:
