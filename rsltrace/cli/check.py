@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
+from rsltrace.cli.output.exit_status import tell_error
 from rsltrace.cli.output.text_file import write_text
-from rsltrace.errors import EXIT_USAGE, NodeError, RunError
+from rsltrace.errors import EXIT_USAGE, RunError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace.trace.words.phrases import table
@@ -106,9 +107,7 @@ def check(
         wrong = tuple(wrong_checks(checked.job, names))
         checked = replace(checked, unused=(*checked.unused, *wrong))
     except RunError as error:
-        if isinstance(error, NodeError) and error.traceback_text:
-            tell(error.traceback_text.rstrip())
-        tell(f"rsltrace: error: {error}")
+        tell_error(error)
         return EXIT_USAGE
     if graph is not None:
         _draw(checked, graph)

@@ -4,31 +4,36 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import os
 import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 from rsltrace.cli.options import json_option, no_pin_option, seed_option, until_option
-from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
+from rsltrace.cli.output.exit_status import (
+    reopen_standard_streams,
+    status_without_output,
+    tell_error,
+)
 from rsltrace.cli.output.search_progress import interruptible, progress
-from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
+from rsltrace.errors import EXIT_USAGE, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.finding import READ_BY, NondeterminismSource
-from rsltrace.trace.model.texts import printable
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace.trace.words.logs import missing_servers, silent_topics, unheard_topics
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import Job
-    from rsltrace.native.native_run import NativeOptions
+    from rsltrace.native.native_run import NativeOptions, NativeResult
     from rsltrace.run import RunResult
     from rsltrace.simulation.loop.stop import Stop
 
@@ -277,17 +282,8 @@ def _record_native(
     as_json: bool,
 ) -> None:
     """Run a job natively, and end the process."""
-    from rsltrace.cli.output.native_run import leave, report_native, run_native
-
-    result = run_native(
-        job,
-        path,
-        options,
-        force=force,
-        echo=not quiet,
-        shows=not (quiet or as_json),
-        note=_note,
-        begins=lambda: _say_if_it_has_no_end(job),
+    result = _run_native(
+        job, path, options, force=force, echo=not quiet, shows=not (quiet or as_json)
     )
     status = result.exit_code
     reopen_standard_streams()
@@ -297,12 +293,12 @@ def _record_native(
         for name, count in result.failed_checks.items():
             times = f"{count} time{'s' if count > 1 else ''}"
             tell(f"check violated {times} while the run went on: {name}")
-        report_native(result, checked, as_json=as_json)
+        _report_native(result, checked, as_json=as_json)
         if bag is not None:
             _export(result.path, bag, force=force)
     except OSError as error:
         status = status_without_output(error, status)
-    leave(result, status)
+    _leave(result, status)
 
 
 def _export(trace: Path, bag: Path, *, force: bool) -> None:
@@ -388,9 +384,7 @@ def _report(
         if note not in shown_notes:  # when the run began
             tell(f"note: {note}")
     if error is not None:
-        if isinstance(error, NodeError) and error.traceback_text:
-            tell(error.traceback_text.rstrip())
-        tell(f"rsltrace: error: {error}")
+        tell_error(error)
     _warn(result)
     for line in [] if checked is None else checked.lines():
         tell(line)
@@ -468,3 +462,79 @@ def _finding_places(path: Path | None) -> dict[tuple[str, str], list[str]]:
 
 _SHOWN_MAX = 8
 _ENVIRONMENT = "os.environ"
+
+
+# rsltrace record --native: run, report and exit.
+
+
+def _run_native(
+    job: Job,
+    path: Path,
+    options: NativeOptions,
+    *,
+    force: bool,
+    echo: bool,
+    shows: bool,
+) -> NativeResult:
+    """Run a job natively; ``shows``: with progress."""
+    from rsltrace.adapters.rclpy.boundary.installation import native_extension
+
+    native_extension()  # before the session's modules, which bind it
+    from rsltrace.native.session import run_natively
+    from rsltrace.run import RunCallbacks
+
+    shown = progress(quiet=not shows, what="observing", time="of real time")
+    with interruptible() as on_interrupt, shown as on_progress:
+
+        def begins(stop: Callable[[Stop], None]) -> None:
+            _say_if_it_has_no_end(job)
+            on_interrupt(stop)
+
+        observer = RunCallbacks(progress=on_progress, interrupt=begins, note=_note)
+        return run_natively(job, path, options, force=force, echo=echo, observer=observer)
+
+
+def _report_native(result: NativeResult, checked: CheckReport | None, *, as_json: bool) -> None:
+    error = result.error
+    for note in result.notes:
+        tell(f"note: {note}")
+    if error is not None:
+        tell_error(error)
+    for line in [] if checked is None else checked.lines():
+        tell(line)
+    if as_json:
+        say(json.dumps(_native_values(result, checked)))
+        return
+    kept = result.kept and f" ({result.kept})"
+    tell(f"wrote {result.path}{kept}: {result.stop_reason}")
+    cost = f"observer {format_duration(result.observer_ns)} per callback"
+    say(f"native  events {result.events}  real {format_seconds(result.duration_ns)}  {cost}")
+
+
+def _native_values(result: NativeResult, checked: CheckReport | None) -> dict[str, Any]:
+    return {
+        "native": True,
+        "path": str(result.path),
+        "digest": None,
+        "events": result.events,
+        "duration_ns": result.duration_ns,
+        "observer_ns": result.observer_ns,
+        "pen_ns": result.pen_ns,
+        "callback_ns": result.callback_ns,
+        "stop_reason": result.stop_reason,
+        "exit_code": result.exit_code,
+        "error": None if result.error is None else str(result.error),
+        "stuck": list(result.stuck),
+        **({} if checked is None else checked.values()),
+        "notes": [*result.notes, *([result.kept] if result.kept else [])],
+    }
+
+
+def _leave(result: NativeResult, status: int) -> None:
+    """End the process, even if the thread of a stuck callback would keep it alive."""
+    if result.stuck:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError, AttributeError):
+                stream.flush()
+        os._exit(status)
+    sys.exit(status)

@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
 from rsltrace.terminal import tell
 
 EXIT_INTERRUPTED = 130
@@ -128,6 +128,13 @@ def status_of(command: Callable[[], object]) -> int:
     except ValueError:
         pass  # closed
     return status
+
+
+def tell_error(error: RsltraceError) -> None:
+    """Print an error, below the traceback if code of a node raised it."""
+    if isinstance(error, NodeError) and error.traceback_text:
+        tell(error.traceback_text.rstrip())
+    tell(f"rsltrace: error: {error}")
 
 
 def status_without_output(error: OSError, status: int = 0) -> int:
