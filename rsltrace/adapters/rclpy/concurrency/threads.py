@@ -49,6 +49,8 @@ _real_get_ident = _thread.get_ident
 _real_start_new_thread = _thread.start_new_thread
 _real_enumerate = threading.enumerate
 _Thread = threading.Thread
+_identity: Callable[[object], int] = object.__hash__
+"""Identifies objects like ``id``, but raises no audit event."""
 _pool_worker = futures_thread._worker
 _real = {name: getattr(_Thread, name) for name in ("start", "join", "is_alive")}
 
@@ -393,7 +395,11 @@ def cooperative_threads(runtime: Runtime) -> Iterator[None]:
         (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
     ]
     with ExitStack() as stack:
-        rebound = {id(getattr(place, name)): value for place, name, value in replaced[3:]}
+        rebound = {
+            _identity(real): value
+            for place, name, value in replaced[3:]
+            if callable(real := getattr(place, name))
+        }
         for place, name, value in replaced:
             replace_attribute(stack, place, name, value)
         _rebind(stack, rebound)
@@ -445,9 +451,10 @@ def _number(stack: ExitStack, cls: Any) -> None:
 def _rebind(stack: ExitStack, values: dict[int, Any]) -> None:
     """Replace names that modules of user code imported before the run."""
     for module in list(sys.modules.values()):
-        file = getattr(module, "__file__", None)
-        if not file or not is_user_file(file):
-            continue
-        for name, value in list(vars(module).items()):
-            if callable(value) and id(value) in values:
-                replace_attribute(stack, module, name, values[id(value)])
+        attributes = getattr(module, "__dict__", {})
+        if values.keys().isdisjoint(map(_identity, attributes.values())):
+            continue  # nearly all; whose a file is may take a look at all installed packages
+        if is_user_file(getattr(module, "__file__", None) or "<frozen"):
+            for name, value in list(attributes.items()):
+                if _identity(value) in values:
+                    replace_attribute(stack, module, name, values[_identity(value)])
