@@ -30,6 +30,7 @@ from rsltrace.adapters.rclpy.concurrency.blocking_calls import calling_runtime, 
 from rsltrace.adapters.rclpy.concurrency.entry_starts import ConstructionEvent
 from rsltrace.adapters.rclpy.concurrency.locks import PoolLock, SimLock, SimRLock
 from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, RunEnded, Runtime
+from rsltrace.guard import loading
 from rsltrace.guard.callers import is_user_file, module_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.libraries import present_import
@@ -400,8 +401,13 @@ def cooperative_threads(runtime: Runtime) -> Iterator[None]:
             for place, name, value in replaced[3:]
             if callable(real := getattr(place, name))
         }
+        outside = [
+            (name, getattr(place, name)) for place, name, _ in replaced if place is threading
+        ]
         for place, name, value in replaced:
             replace_attribute(stack, place, name, value)
+        loading.apart.append(partial(_outside_of_runs, outside))
+        stack.callback(loading.apart.pop)
         _rebind(stack, rebound)
         _number(stack, _Thread)
         _number(stack, futures_base.Future)
@@ -413,6 +419,15 @@ def cooperative_threads(runtime: Runtime) -> Iterator[None]:
             for thread in runtime.threads.alive:
                 if thread.thread is not None:
                     _mark_stopped(thread.thread)
+
+
+@contextmanager
+def _outside_of_runs(values: list[tuple[str, Any]]) -> Iterator[None]:
+    """Let a module have the real attributes of ``threading``, to bind and to derive from."""
+    with ExitStack() as stack:
+        for name, value in values:
+            replace_attribute(stack, threading, name, value)
+        yield
 
 
 def _count() -> int:
