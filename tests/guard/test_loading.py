@@ -16,10 +16,11 @@ import pytest
 from rsltrace.guard.loading import when_loaded
 from rsltrace.guard.pin import PINNED_VARIABLES
 
-LAZY = ("asyncio", "ssl", "sqlite3", "numpy.random", "tracemalloc")
+LAZY = ("asyncio", "ssl", "sqlite3", "numpy.random", "tracemalloc", "_curses", "_elementtree")
 
 IMPORTS = """
-import asyncio, sqlite3, ssl, tracemalloc
+import _curses, asyncio, sqlite3, ssl, tracemalloc
+from xml.etree.ElementTree import Element
 from asyncio import run, sleep
 from numpy.random import default_rng, rand
 import numpy.random
@@ -51,7 +52,8 @@ IN_CALLBACK
         dates = connection.execute("select julianday() > 0").fetchall()
         context = ssl.create_default_context()
         tracemalloc.get_traced_memory()
-        self.get_logger().info(repr([texts, kinds, dates, ssl.MemoryBIO().pending]))
+        shown = repr([Element("a"), Element("b")])
+        self.get_logger().info(repr([texts, kinds, dates, shown, ssl.MemoryBIO().pending]))
 """
 
 RUN = """
