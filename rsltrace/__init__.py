@@ -12,11 +12,12 @@ neither rclpy nor numpy. (To pytest, whose plugin it is: PYTEST_DONT_REWRITE.)
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 from rsltrace._version import __version__
 
+TYPE_CHECKING = False  # not typing's: a command that is started again has no other use for it
 if TYPE_CHECKING:
+    from typing import Any
+
     from rsltrace.checks.evaluate import CheckResult, evaluate_checks
     from rsltrace.checks.latency.measure import ChainLatency, measure_latencies
     from rsltrace.checks.metrics import MetricResult, evaluate_metrics

@@ -113,7 +113,7 @@ def _pinned(env: Mapping[str, str]) -> dict[str, str]:
     """Return the environment that ``pin`` starts a command with."""
     before = {name: env.get(name) for name in PINNED_VARIABLES}
     told = {**before, "addresses": not has_fixed_addresses()}
-    return {**env, **PINNED_VARIABLES, "RSLTRACE_PINNED": json.dumps(told)}
+    return {**env, **PINNED_VARIABLES, "RSLTRACE_PINNED": repr(told)}
 
 
 def serve(requests: socket.socket) -> list[str] | None:

@@ -237,15 +237,12 @@ def replaced_methods(modules: dict[str, ast.Module]) -> set[tuple[str, str]]:
 _NO_METHODS_OF_OURS = {
     ("rsltrace/run/session.py", "note_answer"): "a hook of ProcessAdapter: the guard is made later",
     ("rsltrace/adapters/rclpy/boundary/installation.py", "publish"): "of rclpy's Publisher",
-    ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "__init__"): "of asyncio's loops",
-    ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "_watcher"): "of asyncio's policies",
     ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "step"): "a slot of RecordedPoll",
     ("rsltrace/adapters/rclpy/handles/logs.py", "_line"): "a field of a message",
     ("rsltrace/adapters/rclpy/concurrency/mains.py", "register"): "of the module atexit",
     ("rsltrace/adapters/rclpy/concurrency/mains.py", "unregister"): "of the module atexit",
     ("rsltrace/adapters/rclpy/concurrency/threads.py", "__init__"): "of the user's thread classes",
     ("rsltrace/adapters/rclpy/concurrency/threads.py", "__hash__"): "of the user's thread classes",
-    ("rsltrace/guard/virtual/user_modules.py", "exec_module"): "of Python's loaders",
     ("rsltrace/simulation/middleware/events/dispatcher.py", "entity"): "a field of Event",
 }
 """What has the name of a method, and why it is none of the product's objects'."""
@@ -295,7 +292,7 @@ RUNS_CODE = {
     "rsltrace/adapters/rclpy/messages/interface_classes.py": "import_module",  # classes of messages
     "rsltrace/adapters/rclpy/messages/source_text.py": "compile exec",  # codecs
     "rsltrace/search/explore/worker.py": "import_module",  # what the last run has imported
-    "rsltrace/guard/call_reports.py": "import_module",  # modules of Python that rules name
+    "rsltrace/guard/loading.py": "exec_module",  # what an import loads, and is patched
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
     "rsltrace/guard/virtual/user_modules.py": "compile exec_module",  # the same, with our calls
     "rsltrace/guard/virtual/set_order.py": "pickle",  # makes its pickles of sets ordered

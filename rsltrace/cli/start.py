@@ -6,7 +6,10 @@ import gc
 import os
 import signal
 import sys
-from typing import NoReturn
+
+TYPE_CHECKING = False  # as in ``rsltrace``
+if TYPE_CHECKING:
+    from typing import NoReturn
 
 _ALLOCATIONS = 200_000
 """Allocations between garbage collections. With Python's 700, a short command spent a sixth of its

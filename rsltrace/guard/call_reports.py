@@ -7,13 +7,11 @@ functions that have no audit event, and the class of ``os.environ``.
 from __future__ import annotations
 
 import hashlib
-import importlib
 import os
 import re
-import sqlite3  # a node may import it during the run; it is replaced by then
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from types import FrameType
 from typing import Any
@@ -23,6 +21,7 @@ from rsltrace.guard.callers import is_python_frame, module_of, user_frame
 from rsltrace.guard.frames import caller, code_of, replace_member
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.libraries import TARGETS, is_library
+from rsltrace.guard.loading import when_loaded
 from rsltrace.guard.redirect import redirect, redirect_function
 from rsltrace.guard.rules import (
     AUDIT_EVENTS,
@@ -89,7 +88,7 @@ def is_installed_path(path: object) -> bool:
 REPORTED_MODULES = frozenset(
     name.rpartition(".")[0] for name, rule in RULES.items() if rule.reports is not None
 )
-"""Modules with such functions: those of Python are loaded for it, others are seen when they are."""
+"""Modules with such functions."""
 
 
 def report_functions(stack: ExitStack, module: str) -> None:
@@ -185,6 +184,10 @@ def _connecting(real: Callable[..., Any]) -> Any:
         return connection
 
     return connect
+
+
+def _report_connections(stack: ExitStack) -> None:
+    redirect(stack, sys.modules["_sqlite3"].connect, _connecting)
 
 
 def _report_statement(sql: str) -> None:
@@ -438,14 +441,12 @@ def reported_calls() -> Iterator[None]:
     """Report calls until the block ends."""
     report_audit_events()
     with ExitStack() as stack:
-        owners = {name.rsplit(".", 2)[0] for name in REPORTED_MEMBERS}
-        for module in sorted((REPORTED_MODULES | owners) & sys.stdlib_module_names):
-            with suppress(ImportError):  # not on every system
-                importlib.import_module(module)
-        for module in sorted(REPORTED_MODULES & sys.modules.keys()):
-            report_functions(stack, module)
+        for module in sorted(REPORTED_MODULES):
+            when_loaded(stack, module, partial(report_functions, stack, module))
         for name, source in REPORTED_MEMBERS.items():
-            _report_member(stack, name, source)
-        redirect(stack, sqlite3.connect, _connecting)
+            module = name.rsplit(".", 2)[0]
+            if module in sys.stdlib_module_names or module in sys.modules:  # numpy is by now
+                when_loaded(stack, module, partial(_report_member, stack, name, source))
+        when_loaded(stack, "_sqlite3", partial(_report_connections, stack))
         stack.enter_context(environment_watched())
         yield

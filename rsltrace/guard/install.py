@@ -12,7 +12,6 @@ import resource
 import sys
 import tempfile
 import zlib
-from _elementtree import Element  # type: ignore[import-not-found]
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar, Token
@@ -37,6 +36,7 @@ from rsltrace.guard.callers import is_never_user_code, module_of
 from rsltrace.guard.frames import caller, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.libraries import present_import
+from rsltrace.guard.loading import when_loaded
 from rsltrace.guard.process_ids import real_id, real_path, virtual_id
 from rsltrace.guard.recorded.descriptors import recorded_descriptors
 from rsltrace.guard.recorded.files import recorded_files
@@ -299,12 +299,11 @@ def own_process_ids() -> Iterator[None]:
 _as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
     ("PyInstanceMethod_New", ctypes.pythonapi)
 )
-# ``Element`` is taken from the C module: ``xml.etree.ElementTree`` loads slowly.
 _SHOWING_ADDRESSES = (
     *(object, FunctionType, GeneratorType, CoroutineType, AsyncGeneratorType),
     *(BuiltinMethodType, MethodWrapperType, CodeType, CellType, FrameType),
     *(ReferenceType, ProxyType, CallableProxyType, memoryview),
-    *(ContextVar, Token, type(datetime.datetime_CAPI), Element),
+    *(ContextVar, Token, type(datetime.datetime_CAPI)),
     *(type(hashlib.sha256()), type(ctypes.byref(ctypes.c_int()))),
     ctypes._CFuncPtr,  # type: ignore[attr-defined]
 )
@@ -373,7 +372,12 @@ def numbered_texts() -> Iterator[None]:
     with ExitStack() as stack:
         for kind in _SHOWING_ADDRESSES:
             replace_special_method(stack, kind, "__repr__", _numbered)
+        when_loaded(stack, "_elementtree", partial(_number_elements, stack))
         yield
+
+
+def _number_elements(stack: ExitStack) -> None:
+    replace_special_method(stack, sys.modules["_elementtree"].Element, "__repr__", _numbered)
 
 
 @contextmanager

@@ -49,7 +49,7 @@ _RUNS_NODES = frozenset(("record", "replay", "debug", "analyze"))
 _NOTHING_TO_PIN = frozenset(("--no-pin", "--help", "-h"))
 
 _before = ""
-"""The settings before this process was pinned, as JSON."""
+"""The settings before this process was pinned, as Python writes them."""
 
 
 def pin_recording(words: Sequence[str]) -> None:
@@ -64,12 +64,10 @@ def pin() -> None:
     _before = os.environ.pop(_MARK, _before)  # programs that a node starts are none of ours
     if _before or not sys.orig_argv[1:]:
         return
-    import json  # here, as ctypes below: few commands need them
-
     changes = pinned_variables()
     before = {name: os.environ.get(name) for name in changes}
     fixed = fix_addresses(True)
-    _start_again({**changes, _MARK: json.dumps({**before, "addresses": fixed})})
+    _start_again({**changes, _MARK: repr({**before, "addresses": fixed})})
 
 
 def pinned_variables() -> dict[str, str]:
@@ -93,9 +91,9 @@ def unpin() -> None:
     """Start this command again as it was before ``pin``; return if it was not pinned."""
     if _before in ("", _UNPINNED):
         return
-    import json
+    import ast
 
-    before = json.loads(_before)
+    before = ast.literal_eval(_before)
     if before.pop("addresses", False):
         fix_addresses(False)
     _start_again({**before, _MARK: _UNPINNED})
@@ -130,7 +128,7 @@ def has_fixed_addresses() -> bool:
 
 def _personality(value: int) -> int:
     """Call ``personality``; -1 where the system has none or forbids it."""
-    import ctypes
+    import ctypes  # here: few commands need it
 
     try:
         return int(ctypes.CDLL(None).personality(ctypes.c_ulong(value)))

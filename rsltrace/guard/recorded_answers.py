@@ -10,7 +10,7 @@ import base64
 import binascii
 import json
 import socket
-import ssl
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -84,15 +84,13 @@ _ERRORS = {
         ProcessLookupError,
         socket.gaierror,
         socket.herror,
-        ssl.SSLError,
-        ssl.SSLZeroReturnError,
-        ssl.SSLWantReadError,
-        ssl.SSLWantWriteError,
-        ssl.SSLSyscallError,
-        ssl.SSLEOFError,
-        ssl.SSLCertVerificationError,
     )
 }
+_TLS_ERRORS = (
+    *("SSLError", "SSLZeroReturnError", "SSLWantReadError", "SSLWantWriteError"),
+    *("SSLSyscallError", "SSLEOFError", "SSLCertVerificationError"),
+)
+"""Errors of ``ssl``."""
 _TLS_DETAILS = ("reason", "library", "verify_code", "verify_message")
 
 
@@ -174,11 +172,19 @@ def _parsed(value: str) -> tuple[int, RecordedAnswer]:
 
 def _error_text(error: OSError) -> str:
     kind = type(error).__name__
-    said = [kind if kind in _ERRORS else "OSError", error.errno, error.strerror or str(error)]
-    if isinstance(error, ssl.SSLError):
+    known = kind in _ERRORS or kind in _TLS_ERRORS
+    said = [kind if known else "OSError", error.errno, error.strerror or str(error)]
+    if "ssl" in sys.modules and isinstance(error, _tls_error("SSLError")):
         details = {name: _plain(getattr(error, name, None)) for name in _TLS_DETAILS}
         return json.dumps({"error": [*said, details]})
     return json.dumps({"error": said})
+
+
+def _tls_error(kind: str) -> type[OSError]:
+    import ssl  # which code that meets such errors has loaded
+
+    found: type[OSError] = getattr(ssl, kind)
+    return found
 
 
 def encoded(value: Any) -> str:
@@ -216,7 +222,8 @@ def _value(plain: Any) -> Any:
     if isinstance(plain, dict):
         if "error" in plain:
             kind, number, text, *details = plain["error"]
-            error = _ERRORS.get(kind, OSError)(number, text)
+            made = _tls_error(kind) if kind in _TLS_ERRORS else _ERRORS.get(kind, OSError)
+            error = made(number, text)
             for name, detail in details[0].items() if details else ():
                 if name in _TLS_DETAILS:
                     setattr(error, name, detail)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import ast
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -68,7 +68,7 @@ def test_libraries_are_looked_for_in_one_order(monkeypatch: pytest.MonkeyPatch) 
         "/mine:/site/ros_a.libs",
         "/site/ros_a.libs:/mine",
     ]
-    before = json.loads(started[0]["RSLTRACE_PINNED"])
+    before = ast.literal_eval(started[0]["RSLTRACE_PINNED"])
     assert before["LD_LIBRARY_PATH"] == "/site/ros_b.libs:/mine:/site/ros_a.libs"
 
 

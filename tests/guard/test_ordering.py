@@ -105,7 +105,7 @@ out = (B().take(), A().more(1, b=2), e(), list(g()), m, A.__doc__, dict(a=1), su
     plain: dict[str, Any] = {}
     exec(compile(source, "x.py", "exec"), plain)
     other: dict[str, Any] = {}
-    with user_modules.user_modules(frozenset(), {}):
+    with user_modules.user_modules(frozenset()):
         exec(rewritten(source.encode(), "x.py"), other)
     assert other["out"] == plain["out"]
 

@@ -28,6 +28,7 @@ from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.entry import TypedInput
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.frames import replace_member
+from rsltrace.guard.loading import when_loaded
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.trace.model.texts import waiting_ns
 
@@ -277,27 +278,30 @@ ShowTerminal = Callable[[Terminal, bool], None]
 @contextmanager
 def simulated_curses(caller_terminal: TerminalOfCaller, show: ShowTerminal) -> Iterator[None]:
     """Let curses wait for keys in simulated time within the ``with`` block."""
-    try:
-        import _curses
-    except ImportError:  # Python can be built without it
+    with ExitStack() as stack:
+        when_loaded(stack, "_curses", partial(_simulate_curses, stack, caller_terminal, show))
         yield
-        return
+
+
+def _simulate_curses(
+    stack: ExitStack, caller_terminal: TerminalOfCaller, show: ShowTerminal
+) -> None:
+    import _curses
+
     limits_ms: dict[int, int] = {}
     all_ms = [_FOR_EVER]
     limit = _curses.window.timeout
-    with ExitStack() as stack:
-        for name in _READS:
-            making = partial(_reading, caller_terminal, limits_ms, all_ms, limit)
-            replace_member(stack, _curses.window, name, making)
-        replace_member(stack, _curses.window, "refresh", partial(_drained, caller_terminal))
-        replace_member(stack, _curses.window, "nodelay", partial(_limiting, limits_ms, _of_nodelay))
-        replace_member(stack, _curses.window, "timeout", partial(_limiting, limits_ms, int))
-        redirect(stack, _curses.doupdate, partial(_drained, caller_terminal))
-        redirect(stack, _curses.halfdelay, partial(_halving, all_ms))
-        for function in (_curses.setupterm, _curses.initscr):
-            redirect(stack, function, partial(_beginning, caller_terminal, show))
-        redirect(stack, _curses.endwin, partial(_ending, caller_terminal, show))
-        yield
+    for name in _READS:
+        making = partial(_reading, caller_terminal, limits_ms, all_ms, limit)
+        replace_member(stack, _curses.window, name, making)
+    replace_member(stack, _curses.window, "refresh", partial(_drained, caller_terminal))
+    replace_member(stack, _curses.window, "nodelay", partial(_limiting, limits_ms, _of_nodelay))
+    replace_member(stack, _curses.window, "timeout", partial(_limiting, limits_ms, int))
+    redirect(stack, _curses.doupdate, partial(_drained, caller_terminal))
+    redirect(stack, _curses.halfdelay, partial(_halving, all_ms))
+    for function in (_curses.setupterm, _curses.initscr):
+        redirect(stack, function, partial(_beginning, caller_terminal, show))
+    redirect(stack, _curses.endwin, partial(_ending, caller_terminal, show))
 
 
 def _beginning(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import _socket
 import socket
-import ssl
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,6 +16,7 @@ from typing import Any
 
 from rsltrace.guard.frames import replace_member
 from rsltrace.guard.guard import Guard
+from rsltrace.guard.loading import when_loaded
 from rsltrace.guard.recorded.descriptors import connected_ends, recording_call, recording_guard
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.waiting import wait_readable, wait_recorded, wait_unrecorded, waiting_guard
@@ -211,22 +211,26 @@ def recorded_sockets() -> Iterator[None]:
             put_back = partial(setattr, kind, name, vars(kind).get(name))
             stack.callback(put_back if name in vars(kind) else partial(delattr, kind, name))
             setattr(kind, name, make(getattr(kind, name)))
-        tls: Any = sys.modules["_ssl"]._SSLSocket  # below both ssl.SSLSocket and ssl.SSLObject
-        memory = ssl.MemoryBIO
-        for name in _TLS:
-            replace_member(
-                stack,
-                tls,
-                name,
-                partial(recording_call, NondeterminismSource.SOCKET, f"TLS.{name}()"),
-            )
-        replace_member(stack, tls, "read", _reading)
-        for name in _BUFFERED:
-            replace_member(
-                stack,
-                memory,
-                name,
-                partial(recording_call, NondeterminismSource.SOCKET, f"MemoryBIO.{name}()"),
-            )
-        replace_member(stack, memory, "pending", _pending)
+        when_loaded(stack, "_ssl", partial(_record_tls, stack))
         yield
+
+
+def _record_tls(stack: ExitStack) -> None:
+    module: Any = sys.modules["_ssl"]
+    tls, memory = module._SSLSocket, module.MemoryBIO  # below ssl.SSLSocket and ssl.SSLObject
+    for name in _TLS:
+        replace_member(
+            stack,
+            tls,
+            name,
+            partial(recording_call, NondeterminismSource.SOCKET, f"TLS.{name}()"),
+        )
+    replace_member(stack, tls, "read", _reading)
+    for name in _BUFFERED:
+        replace_member(
+            stack,
+            memory,
+            name,
+            partial(recording_call, NondeterminismSource.SOCKET, f"MemoryBIO.{name}()"),
+        )
+    replace_member(stack, memory, "pending", _pending)

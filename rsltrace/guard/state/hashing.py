@@ -17,6 +17,7 @@ import fractions
 import functools
 import pathlib
 import struct
+import sys
 import types
 import uuid
 import weakref
@@ -360,8 +361,6 @@ _HANDLERS: dict[type, _Handler] = {
     types.MethodType: StateHasher._bound,
     functools.partial: StateHasher._partial,
     np.ndarray: StateHasher._array,
-    np.random.Generator: StateHasher._generator,
-    np.random.RandomState: StateHasher._legacy_generator,
 }
 _SKIPPED_TYPES = (
     types.GeneratorType,
@@ -383,6 +382,11 @@ def _handler_of(kind: type) -> _Handler:
 def _choose(kind: type) -> _Handler:
     import random
 
+    of_numpy = sys.modules.get("numpy.random")  # not loaded for nodes that have none
+    if kind is getattr(of_numpy, "Generator", None):
+        return StateHasher._generator
+    if kind is getattr(of_numpy, "RandomState", None):
+        return StateHasher._legacy_generator
     if hasattr(kind, "rsltrace_state"):
         return StateHasher._object
     if _is_left_out(kind):

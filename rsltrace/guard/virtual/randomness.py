@@ -24,6 +24,7 @@ from rsltrace.guard import frames
 from rsltrace.guard.callers import FILE_OWNERS, OURS
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.loading import when_loaded
 from rsltrace.guard.redirect import (
     Redirected,
     RedirectedMethod,
@@ -36,6 +37,7 @@ from rsltrace.guard.redirect import (
 from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
 _RANDOM = NondeterminismSource.RANDOM
+_NUMPY = "numpy.random"
 _NODE_ID = 0x02_00_00_00_00_01
 """A locally administered MAC address, for ``uuid1`` and ``getnode``."""
 
@@ -128,12 +130,14 @@ def virtual_randomness() -> Iterator[None]:
         _entropy(stack)
         _unseeded(stack)
         _uuids(stack)
-        if "numpy" in sys.modules:
-            import numpy as np
-
-            _module_functions(stack, np.random, np.random.mtrand._rand, "numpy.random", _numpy_of)
-            _shared_numpy(stack, np.random)
+        when_loaded(stack, _NUMPY, partial(_numpy_functions, stack))
         yield
+
+
+def _numpy_functions(stack: ExitStack) -> None:
+    module: Any = sys.modules[_NUMPY]
+    _module_functions(stack, module, module.mtrand._rand, _NUMPY, _numpy_of)
+    _shared_numpy(stack, module)
 
 
 class _SharedGenerator(random.Random):
@@ -278,9 +282,12 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
         replace_attribute(stack, place, "seed", draw)
 
 
-def seed_shared_generator(seed: int) -> None:
-    """Seed numpy's shared generator, which cannot be divided into streams."""
-    if "numpy" in sys.modules:
-        import numpy as np
+def seed_shared_generator(stack: ExitStack, seed: int) -> None:
+    """Seed numpy's shared generator, which cannot be divided into streams, for the run of
+    ``stack``."""
 
-        np.random.mtrand._rand.seed(random.Random(f"numpy {seed}").getrandbits(32))
+    def begin() -> None:
+        module: Any = sys.modules[_NUMPY]
+        module.mtrand._rand.seed(random.Random(f"numpy {seed}").getrandbits(32))
+
+    when_loaded(stack, _NUMPY, begin)

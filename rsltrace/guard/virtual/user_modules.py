@@ -11,16 +11,15 @@ import ast
 import builtins
 import importlib.machinery
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import CodeType, ModuleType
 from typing import Any
 
 from rsltrace.guard.addresses import hash_method
-from rsltrace.guard.call_reports import REPORTED_MODULES, report_functions
 from rsltrace.guard.callers import is_installed, is_rsltrace_module, is_user_file
 from rsltrace.guard.libraries import importing, is_library
+from rsltrace.guard.loading import found_otherwise
 from rsltrace.guard.virtual.arrays import filled
 from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.guard.virtual.original_code import keep_source
@@ -153,14 +152,10 @@ class _ModuleFinder:
     def __init__(
         self,
         packages: frozenset[str],
-        on_loaded: Mapping[str, Callable[[], None]],
         rewrites: bool,
-        stack: ExitStack,
     ) -> None:
         self._packages = packages
-        self._on_loaded = on_loaded
         self.rewrites = rewrites
-        self._stack = stack
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -168,7 +163,7 @@ class _ModuleFinder:
         """Return a module's spec, with its own loader unless it is one of Python's or ROS's."""
         if name in sys.builtin_module_names or is_rsltrace_module(name):
             return None
-        spec = self._found_otherwise(name, path, target)
+        spec = found_otherwise(self, name, path, target)
         if spec is None or type(spec.loader) is not importlib.machinery.SourceFileLoader:
             return None
         file = spec.origin or ""
@@ -178,47 +173,12 @@ class _ModuleFinder:
             spec.loader = _Loader(spec.loader, rewrites=self.rewrites, library=library)
         elif is_library(file):
             spec.loader = _Loader(spec.loader, rewrites=False, library=True)
-        if name in REPORTED_MODULES:
-            _call_when_loaded(spec.loader, partial(report_functions, self._stack, name))
-        if name in self._on_loaded:
-            _call_when_loaded(spec.loader, self._on_loaded[name])
         return spec
-
-    def _found_otherwise(
-        self, name: str, path: Sequence[str] | None, target: ModuleType | None
-    ) -> importlib.machinery.ModuleSpec | None:
-        """Ask the other finders: editable packages have their own."""
-        for finder in sys.meta_path:
-            find_spec = getattr(finder, "find_spec", None)
-            if finder is not self and find_spec is not None:
-                spec: importlib.machinery.ModuleSpec | None = find_spec(name, path, target)
-                if spec is not None:
-                    return spec
-        return None
-
-
-def _call_when_loaded(loader: Any, on_loaded: Callable[[], None]) -> None:
-    """Call a function when a loader has loaded its module."""
-    real = loader.exec_module
-
-    def exec_module(module: ModuleType) -> None:
-        real(module)
-        on_loaded()
-
-    loader.exec_module = exec_module
 
 
 @contextmanager
-def user_modules(
-    packages: frozenset[str],
-    on_loaded: Mapping[str, Callable[[], None]],
-    *,
-    rewrites: bool = True,
-) -> Iterator[None]:
-    """Compile user modules imported from now on with the guard's calls, if ``rewrites``.
-
-    ``on_loaded`` maps libraries to functions that are called when they are loaded.
-    """
+def user_modules(packages: frozenset[str], *, rewrites: bool = True) -> Iterator[None]:
+    """Compile user modules imported from now on with the guard's calls, if ``rewrites``."""
     helpers: dict[str, Callable[..., Any]] = {
         _ORDERED: in_set_order,
         _HASH: hash_method,
@@ -227,8 +187,9 @@ def user_modules(
     }
     for name, function in helpers.items():
         setattr(builtins, name, function)  # for good: modules may outlive the run
-    with ExitStack() as stack:
-        finder = _ModuleFinder(packages, on_loaded, rewrites, stack)
-        sys.meta_path.insert(0, finder)
-        stack.callback(sys.meta_path.remove, finder)
+    finder = _ModuleFinder(packages, rewrites)
+    sys.meta_path.insert(0, finder)
+    try:
         yield
+    finally:
+        sys.meta_path.remove(finder)

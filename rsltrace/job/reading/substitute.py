@@ -5,7 +5,6 @@ Only looking up, never running: a job is read without executing anything.
 
 from __future__ import annotations
 
-import difflib
 import os
 import shlex
 import sys
@@ -128,6 +127,8 @@ class JobSubstitution:
     def _env(self, written: str, item: YamlValue, name: str, default: str | None = None) -> str:
         value = os.environ.get(name, default)
         if value is None:
+            import difflib  # only for whoever made a mistake
+
             close = difflib.get_close_matches(name, sorted(os.environ), n=1, cutoff=0.8)
             hint = f" ({close[0]} is)" if close else ""
             raise _error(

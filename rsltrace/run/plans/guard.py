@@ -16,6 +16,7 @@ from rsltrace.errors import JobError
 from rsltrace.guard.callers import is_rsltrace_module, module_of
 from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
+from rsltrace.guard.loading import when_loaded
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
 from rsltrace.guard.virtual.original_code import CODE_READERS, show_original
@@ -115,7 +116,7 @@ class RunGuard:
                 on_finding=on_finding,
                 one_policy=all(spec.guard is None for spec in job.nodes),
             )
-            seed_shared_generator(job.seed)
+            seed_shared_generator(self._stack, job.seed)
             for library, why in self._unpinned:
                 self._report(self.guard, library, why, sys._getframe())
             if replay is not None:
@@ -199,7 +200,8 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
             stack.enter_context(pinned_place())
             stack.enter_context(one_tbb_thread(made.report_unpinned_library))
         stack.enter_context(installed())
-        at_once: dict[str, Callable[[], None]] = {
+        patches: dict[str, Callable[[], None]] = {
+            "torch": made.torch_loaded,
             "cv2": lambda: opencv_clock(stack),
             "pygame": lambda: pygame_clock(stack),
             TORCH_COMPILER: plain_in_graphs,
@@ -208,12 +210,10 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
         }
         orders = _orders_sets(job)
         if orders:
-            at_once[PYTEST_REWRITER] = lambda: rewrite_in_pytest(stack)
-        for name, begin in at_once.items():
-            if name in sys.modules:
-                begin()
-        on_loaded = {"torch": made.torch_loaded, **at_once}
-        stack.enter_context(user_modules(node_packages(job.nodes), on_loaded, rewrites=orders))
+            patches[PYTEST_REWRITER] = lambda: rewrite_in_pytest(stack)
+        stack.enter_context(user_modules(node_packages(job.nodes), rewrites=orders))
+        for name, patch in patches.items():
+            when_loaded(stack, name, patch)
     return made
 
 

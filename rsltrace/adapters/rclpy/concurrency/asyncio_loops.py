@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
-import asyncio.selector_events
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any
 
 from rsltrace.adapters.rclpy.concurrency.blocking_calls import POLL_NS, calling_runtime, wait
+from rsltrace.adapters.rclpy.concurrency.program import places
 from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
+from rsltrace.guard.loading import when_loaded
 from rsltrace.guard.recorded.polls import RecordedPoll
+from rsltrace.guard.redirect import replace_attribute
 
 _NS_PER_S = 1_000_000_000
 
@@ -89,6 +91,15 @@ class SimSelector:
 @contextmanager
 def simulated_event_loops(runtime: Runtime) -> Iterator[None]:
     """Give simulated time to asyncio loops that are made within the ``with`` block."""
+    with ExitStack() as stack:
+        when_loaded(stack, "asyncio", partial(_simulate_loops, stack, runtime))
+        yield
+
+
+def _simulate_loops(stack: ExitStack, runtime: Runtime) -> None:
+    import asyncio.selector_events
+
+    runtime.programs.places = places()
     base: Any = asyncio.BaseEventLoop
     selecting: Any = asyncio.selector_events.BaseSelectorEventLoop
     real_time, real_init = base.time, selecting.__init__
@@ -113,17 +124,10 @@ def simulated_event_loops(runtime: Runtime) -> Iterator[None]:
         if isinstance(self._selector, SimSelector):
             self._selector.wake()
 
-    base.time, selecting.__init__ = time, __init__
-    selecting._write_to_self = _write_to_self
+    replace_attribute(stack, base, "time", time)
+    replace_attribute(stack, selecting, "__init__", __init__)
+    replace_attribute(stack, selecting, "_write_to_self", _write_to_self)
     # The child watcher numbers its threads: do not count those of another run.
     policy: Any = asyncio.get_event_loop_policy()
-    watcher = getattr(policy, "_watcher", None)
-    if watcher is not None:
-        policy._watcher = None
-    try:
-        yield
-    finally:
-        if hasattr(policy, "_watcher"):
-            policy._watcher = watcher
-        base.time, selecting.__init__ = real_time, real_init
-        selecting._write_to_self = real_write
+    if hasattr(policy, "_watcher"):
+        replace_attribute(stack, policy, "_watcher", None)

@@ -13,8 +13,6 @@ import threading
 import time
 import uuid
 from _thread import get_ident
-from asyncio import _get_running_loop, _set_running_loop, current_task
-from asyncio.tasks import _enter_task, _leave_task
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -98,14 +96,22 @@ def wait(
     return not blocked.timed_out
 
 
+def running_loop() -> Any:
+    """Return the asyncio loop that runs on this stack, without loading asyncio."""
+    return getattr(sys.modules.get("asyncio"), "_get_running_loop", _nothing)()
+
+
 def leave_asyncio() -> Callable[[], None]:
     """Leave this stack's asyncio loop and task, if it runs in one; return what enters them again.
 
     Asyncio keeps one of each per thread; here each stack has its own.
     """
-    loop = _get_running_loop()
+    loop = running_loop()
     if loop is None:
         return _nothing
+    from asyncio import _set_running_loop, current_task
+    from asyncio.tasks import _enter_task, _leave_task
+
     task = current_task(loop)
     if task is not None:
         _leave_task(loop, task)

@@ -11,7 +11,6 @@ import builtins
 import sys
 from collections import deque
 from collections.abc import Callable
-from functools import lru_cache
 from types import ModuleType
 from typing import Any, Protocol
 
@@ -50,7 +49,7 @@ class SimulatedPrograms:
     """
 
     def __init__(self) -> None:
-        self.places = _places()
+        self.places = places()
         self.host = SimulatedProgram(self)
         self.present = self.host
         self.all: list[SimulatedProgram] = []
@@ -179,15 +178,14 @@ class SimulatedProgram:
         self.failures.clear()
 
 
-@lru_cache(maxsize=1)
-def _places() -> tuple[dict[str, Any], ...]:
+def places() -> tuple[dict[str, Any], ...]:
     """Return the namespaces that hold per-process values."""
-    import asyncio.events
-
     import rclpy
     import rclpy.context
     import rclpy.utilities
 
     modules: dict[str, Any] = sys.modules
-    context, loops = vars(rclpy.context), vars(asyncio.events)
+    asyncio = modules.get("asyncio.events")  # not loaded for nodes that do not use it
+    context = vars(rclpy.context)
+    loops = {"_event_loop_policy": None} if asyncio is None else vars(asyncio)
     return vars(sys), modules, vars(rclpy), vars(rclpy.utilities), context, loops

@@ -30,6 +30,7 @@ from rsltrace.adapters.rclpy.concurrency.blocking_calls import calling_runtime, 
 from rsltrace.adapters.rclpy.concurrency.entry_starts import ConstructionEvent
 from rsltrace.adapters.rclpy.concurrency.locks import PoolLock, SimLock, SimRLock
 from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, RunEnded, Runtime
+from rsltrace.guard import loading
 from rsltrace.guard.callers import is_user_file, module_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.libraries import present_import
@@ -49,6 +50,8 @@ _real_get_ident = _thread.get_ident
 _real_start_new_thread = _thread.start_new_thread
 _real_enumerate = threading.enumerate
 _Thread = threading.Thread
+_identity: Callable[[object], int] = object.__hash__
+"""Identifies objects like ``id``, but raises no audit event."""
 _pool_worker = futures_thread._worker
 _real = {name: getattr(_Thread, name) for name in ("start", "join", "is_alive")}
 
@@ -393,9 +396,18 @@ def cooperative_threads(runtime: Runtime) -> Iterator[None]:
         (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
     ]
     with ExitStack() as stack:
-        rebound = {id(getattr(place, name)): value for place, name, value in replaced[3:]}
+        rebound = {
+            _identity(real): value
+            for place, name, value in replaced[3:]
+            if callable(real := getattr(place, name))
+        }
+        outside = [
+            (name, getattr(place, name)) for place, name, _ in replaced if place is threading
+        ]
         for place, name, value in replaced:
             replace_attribute(stack, place, name, value)
+        loading.apart.append(partial(_outside_of_runs, outside))
+        stack.callback(loading.apart.pop)
         _rebind(stack, rebound)
         _number(stack, _Thread)
         _number(stack, futures_base.Future)
@@ -407,6 +419,15 @@ def cooperative_threads(runtime: Runtime) -> Iterator[None]:
             for thread in runtime.threads.alive:
                 if thread.thread is not None:
                     _mark_stopped(thread.thread)
+
+
+@contextmanager
+def _outside_of_runs(values: list[tuple[str, Any]]) -> Iterator[None]:
+    """Let a module have the real attributes of ``threading``, to bind and to derive from."""
+    with ExitStack() as stack:
+        for name, value in values:
+            replace_attribute(stack, threading, name, value)
+        yield
 
 
 def _count() -> int:
@@ -445,9 +466,10 @@ def _number(stack: ExitStack, cls: Any) -> None:
 def _rebind(stack: ExitStack, values: dict[int, Any]) -> None:
     """Replace names that modules of user code imported before the run."""
     for module in list(sys.modules.values()):
-        file = getattr(module, "__file__", None)
-        if not file or not is_user_file(file):
-            continue
-        for name, value in list(vars(module).items()):
-            if callable(value) and id(value) in values:
-                replace_attribute(stack, module, name, values[id(value)])
+        attributes = getattr(module, "__dict__", {})
+        if values.keys().isdisjoint(map(_identity, attributes.values())):
+            continue  # nearly all; whose a file is may take a look at all installed packages
+        if is_user_file(getattr(module, "__file__", None) or "<frozen"):
+            for name, value in list(attributes.items()):
+                if _identity(value) in values:
+                    replace_attribute(stack, module, name, values[_identity(value)])

@@ -10,7 +10,6 @@ they may block, spin or raise, are the same.
 from __future__ import annotations
 
 import sys
-from asyncio import _get_running_loop
 from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
@@ -19,6 +18,7 @@ from typing import Any, NamedTuple, Protocol
 
 from greenlet import getcurrent, greenlet
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import running_loop
 from rsltrace.adapters.rclpy.concurrency.callback_groups import is_busy, is_custom
 from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox
 from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
@@ -216,7 +216,7 @@ def standby_of(
         or runtime.dispatcher.resume_observers
         or event.on_end is not None
         or not isinstance(event.handle, OutsideEvent)
-        or _get_running_loop() is not None
+        or running_loop() is not None
     ):
         return None
     own = _rclpy_code()
