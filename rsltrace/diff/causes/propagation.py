@@ -9,7 +9,7 @@ from, so that the way back to the root can be shown.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair, mark_inverted
@@ -26,6 +26,7 @@ from rsltrace.diff.alignment.rows import (
     counts,
 )
 from rsltrace.diff.causes.relevance import resolved_job
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
