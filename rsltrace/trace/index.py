@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import field
+from functools import cache
 from itertools import accumulate, chain
 from struct import unpack
 from typing import ClassVar, NamedTuple
@@ -33,13 +34,13 @@ from rsltrace.trace.mcap.records import (
     MESSAGE,
     MESSAGE_HEAD,
     RECORD_HEAD,
-    ChunkIndexEntry,
     DamageError,
     McapHeader,
     McapSchema,
     RecordFields,
     RecordSpan,
     TruncatedFile,
+    parse_chunk_index,
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource
@@ -243,7 +244,9 @@ def read_summary(source: ByteSource) -> TraceIndex:
     except DamageError as error:
         raise damage_error(source, footer.summary_start, "the summary", error) from error
     index.take(summary)
-    index.chunks_with = lambda channels: [_chunk_entry(c) for c in summary.chunks(channels)]
+    # Kept, since with hundreds of topics nearly every chunk is asked for by each of these.
+    entry = cache(_chunk_entry)
+    index.chunks_with = lambda channels: [*map(entry, summary.chunk_indexes(channels))]
     check_version(source, index)
     if ATTACHMENT_INDEX not in index.attachments:
         raise TraceFormatError(f"{source.name} is incomplete: {ATTACHMENT_INDEX} is missing in it")
@@ -251,15 +254,19 @@ def read_summary(source: ByteSource) -> TraceIndex:
     return index
 
 
-def _chunk_entry(chunk: ChunkIndexEntry) -> ChunkEntry:
+def _chunk_entry(body: bytes) -> ChunkEntry:
+    chunk = parse_chunk_index(body)
     # Each index ends where the next one begins, which gives the number of messages.
     starts = sorted((at, channel_id) for channel_id, at in chunk.indexes)
-    indexes: dict[int, RecordSpan] = {}
-    counts: dict[int, int] = {}
-    for position, (at, channel_id) in enumerate(starts):
-        end = starts[position + 1][0] if position + 1 < len(starts) else chunk.end
-        indexes[channel_id] = RecordSpan(at, end - at)
-        counts[channel_id] = (end - at - MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
+    ends = [*(at for at, _ in starts[1:]), chunk.end]
+    indexes = {
+        channel_id: RecordSpan(at, end - at)
+        for (at, channel_id), end in zip(starts, ends, strict=False)
+    }
+    counts = {
+        channel_id: (span.length - MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
+        for channel_id, span in indexes.items()
+    }
     return ChunkEntry(chunk.span, counts, indexes)
 
 

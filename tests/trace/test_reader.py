@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.writer import Writer
-from trace_maker import Feeder, Opened, boundaries, opcodes, write_run
+from trace_maker import Feeder, Opened, boundaries, opcodes, uint64_message, write_run
 
 from rsltrace.errors import TraceError, TraceFormatError
 from rsltrace.trace import index as index_module
@@ -22,6 +23,7 @@ from rsltrace.trace.mcap.source import FileSource
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import RUN, Trace
+from rsltrace.trace.writer import TraceWriter
 
 EVENTS = 2 * EVENTS_PER_SEGMENT + 500
 
@@ -203,6 +205,29 @@ def test_a_topic_with_two_types_has_its_payloads_apart(tmp_path: Path) -> None:
         payloads = [trace.payload(output) for output in trace.outputs_of(0)]
         assert payloads == [(1, "/t", b"a/A"), (1, "/t", b"b/B")]
         assert [data for _, _, data in trace.messages("/t")] == [b"a/A", b"b/B"]
+
+
+def test_hundreds_of_topics_do_not_each_keep_the_indexes_of_all_chunks(tmp_path: Path) -> None:
+    topics, chunks = 200, 10
+    with TraceWriter(tmp_path / "run.mcap", force=False) as writer:
+        channels = [
+            writer.add_channel(f"/topic{n}", "std_msgs/msg/UInt64", "uint64 data\n")
+            for n in range(topics)
+        ]
+        for _ in range(chunks):
+            for channel in channels:
+                writer.add_payload(channel, 0, uint64_message(1))
+            writer._write_payloads()
+        writer.close(result={})
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        tracemalloc.start()
+        try:
+            for channel in channels:
+                trace.message(channel, chunks - 1)
+            kept, _ = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert kept / (topics * chunks) < 2000  # bytes for each message that the indexes name
 
 
 def test_opening_reads_the_ends_of_the_file_only(tmp_path: Path) -> None:

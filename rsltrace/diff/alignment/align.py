@@ -355,21 +355,27 @@ def _causes(
 
     NO_CAUSE for events without one, UNKNOWN where the cause has (as yet) no counterpart.
     """
-    causes_a, causes_b = [], []
-    first, end = a.first, a.first + len(pairs.a)
-    for cause in a.cause:
-        if cause == NO_EVENT:
-            causes_a.append(NO_CAUSE)
-        elif first <= cause < end:
-            causes_a.append(cause if pairs.a[cause - first] >= 0 else UNKNOWN)
-        else:
-            causes_a.append(cause if past.has_partner(cause) else UNKNOWN)
-    first, end = b.first, b.first + len(pairs.b)
-    for cause in b.cause:
-        if cause == NO_EVENT:
-            causes_b.append(NO_CAUSE)
-        elif first <= cause < end and (place := pairs.b[cause - first]) >= 0:
-            causes_b.append(a.first + place)
-        else:
-            causes_b.append(past.in_a(cause) if not first <= cause < end else UNKNOWN)
+    # Of an event of this block: its index, if it has a counterpart.
+    own_a = [a.first + i if j >= 0 else UNKNOWN for i, j in enumerate(pairs.a)]
+    own_b = [a.first + i if i >= 0 else UNKNOWN for i in pairs.b]
+    first, end = a.first, a.first + len(own_a)
+    causes_a = [
+        NO_CAUSE
+        if cause == NO_EVENT
+        else own_a[cause - first]
+        if first <= cause < end
+        else cause
+        if past.has_partner(cause)
+        else UNKNOWN
+        for cause in a.cause
+    ]
+    first, end = b.first, b.first + len(own_b)
+    causes_b = [
+        NO_CAUSE
+        if cause == NO_EVENT
+        else own_b[cause - first]
+        if first <= cause < end
+        else past.in_a(cause)
+        for cause in b.cause
+    ]
     return causes_a, causes_b

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +22,7 @@ from rsltrace.diff.alignment.rows import (
     load_rows,
     longest_increasing,
 )
+from rsltrace.fast_dataclass import dataclass
 
 NOTHING = -1
 

@@ -8,13 +8,14 @@ Everything behind this module speaks of *numbers*, which mean the same entity in
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import EntityKey

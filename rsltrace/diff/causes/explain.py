@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.row_sign import RowSign
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.operation import PARAMETER_EVENTS

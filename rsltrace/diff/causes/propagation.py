@@ -9,7 +9,7 @@ from, so that the way back to the root can be shown.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair, mark_inverted
@@ -26,6 +26,7 @@ from rsltrace.diff.alignment.rows import (
     counts,
 )
 from rsltrace.diff.causes.relevance import resolved_job
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
@@ -39,6 +40,7 @@ REACHING = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONS
 
 UNDECIDED = -1
 _DRAW = int(OutputKind.DRAW)
+_ENTITY = int(OutputKind.ENTITY)
 _RESUME = int(EventKind.RESUME)
 
 _REMEMBERED_MAX = 50_000
@@ -103,7 +105,9 @@ class Propagation:
         self._drawn: DivergenceOrigin | None = None
         self._made: dict[int, DivergenceOrigin] = {}
         self._busy: DivergenceOrigin | None = None
-        self._passed_on: dict[tuple[int, bool], tuple[frozenset[int], frozenset[int]]] = {}
+        self._different: dict[tuple[int, int], list[OutputRow]] = {}
+        """In which outputs an item of this block differs."""
+        self._passed_on: dict[tuple[int, bool], tuple[set[int], set[int]]] = {}
         """By a cause in this block and its run, since one can have thousands of consequences: for
         what it drew other numbers, and which of its outputs the other run does not have."""
 
@@ -127,6 +131,7 @@ class Propagation:
         """Go through a block. ``first``, if given, is the divergence the search has found: it
         is a root whatever else there is, and comes before everything."""
         self._block = block
+        self._different.clear()
         self._passed_on.clear()
         if first is not None:
             self._seed(first)
@@ -347,10 +352,10 @@ class Propagation:
     def _acting(self, rows: EventColumns, place: int) -> int:
         """Return whose doing an event is: of a constructor, the node that it starts again (0: it
         starts it for the first time)."""
-        matching = rows.run.matching
-        key = matching.keys[rows.number[place]]
         if rows.kind[place] != CONSTRUCT:
             return rows.owner[place]
+        matching = rows.run.matching
+        key = matching.keys[rows.number[place]]
         return matching.by_key.get(replace(key, ordinal=key.ordinal - 1), 0)
 
     def _passes_on(
@@ -374,12 +379,13 @@ class Propagation:
         nth = rows.cause_output[at - rows.first]
         if nth >= rows.output_counts[mine - rows.first]:
             return True
-        if (mine, rows.run.of_b) not in self._passed_on:
+        known = self._passed_on.get((mine, rows.run.of_b))
+        if known is None:
             other = b if rows is a else a
-            drawn = frozenset(o[1] for o in self._different_outputs(cause) if o[0] == _DRAW)
-            alone = frozenset(places_beyond(rows.outputs(mine), other.outputs(theirs)))
-            self._passed_on[mine, rows.run.of_b] = drawn, alone
-        drawn, alone = self._passed_on[mine, rows.run.of_b]
+            drawn = {o[1] for o in self._different_outputs(cause) if o[0] == _DRAW}
+            known = drawn, {*places_beyond(rows.outputs(mine), other.outputs(theirs))}
+            self._passed_on[mine, rows.run.of_b] = known
+        drawn, alone = known
         # A delay is drawn for the receiver, an execution time for what ran.
         if rows.number[at - rows.first] in drawn or rows.number[mine - rows.first] in drawn:
             return True
@@ -391,7 +397,7 @@ class Propagation:
         """Note what a differing event affects: its node, and the topics of what it sent."""
         rows, index = self._rows(item)
         place = index - rows.first
-        owner = rows.owner[place]
+        owner, matching = rows.owner[place], rows.run.matching
         if item.same:
             # Only reordered: its node notices only if it received two inputs in a different order.
             self._inverted_in[owner] = self._inverted_in.get(owner, 0) + 1
@@ -399,32 +405,38 @@ class Propagation:
                 self._taint(owner, origin)
             return
         outputs = self._different_outputs(item)
-        nodes, number = rows.run.matching.nodes, rows.number[place]
-        ran_alone = item.a < 0 or item.b < 0
-        if ran_alone or not outputs or any(o[0] != _DRAW or nodes[o[1]] == o[1] for o in outputs):
-            # A draw for a link does not change the sender; one for its clock does.
-            self._taint(owner, origin)
-        if any(o[0] == _DRAW for o in outputs):
-            self._drawn = self._drawn or origin
-        takes_longer = any(o[:2] == (_DRAW, number) for o in outputs)
-        if takes_longer or (self._workers_are_shared and self._waits_otherwise(item)):
-            self._busy = self._busy or origin
-        found = self.found[origin.root]
+        nodes, keys = matching.nodes, matching.keys
+        moved_ns = self._moved_by(item)
+        stamp = self._block.stamp(item) + min(moved_ns, 0)
+        reached = self.found[origin.root].reached
+        changes_owner = not outputs or item.a < 0 or item.b < 0
+        takes_longer = self._workers_are_shared and self._waits_otherwise(item)
         for kind, number, _, _ in outputs:
-            if kind == OutputKind.ENTITY:  # the node may be one that only this run has
+            if kind == _DRAW:
+                # A draw for a link does not change the sender; one for its clock does.
+                changes_owner = changes_owner or nodes[number] == number
+                takes_longer = takes_longer or number == rows.number[place]
+                self._drawn = self._drawn or origin
+                continue
+            changes_owner = True
+            if kind == _ENTITY:  # the node may be one that only this run has
                 self._made.setdefault(number, origin)
-                self._taint(rows.run.matching.nodes[number], origin)
+                self._taint(nodes[number], origin)
             elif kind in REACHING:
-                self._reach(found, number, self._first_stamp(item), 0)
-                self._sent.setdefault(rows.run.matching.keys[number].name, origin)
+                _reach(reached, number, stamp, 0)
+                self._sent.setdefault(keys[number].name, origin)
+        if changes_owner:
+            self._taint(owner, origin)
+        if takes_longer:
+            self._busy = self._busy or origin
         if rows.kind[place] == CONSTRUCT:  # a program and the node that it makes are one
-            keys = rows.run.matching.keys
             for kind, number, _, _ in rows.outputs(index):
-                if kind == OutputKind.ENTITY and keys[number].kind in OF_THEIR_OWN:
+                if kind == _ENTITY and keys[number].kind in OF_THEIR_OWN:
                     self._taint(number, origin)
-        for kind, number, _, _ in self._moved_outputs(item, outputs):
-            if kind in REACHING:
-                self._reach(found, number, self._first_stamp(item), self._moved_by(item))
+        if moved_ns:  # what both runs have was sent at another time
+            for kind, number, _, _ in beyond(rows.outputs(index), outputs):
+                if kind in REACHING:
+                    _reach(reached, number, stamp, moved_ns)
 
     @cached_property
     def _workers_are_shared(self) -> bool:
@@ -443,13 +455,6 @@ class Propagation:
                 waits.append(bool(rows.flags[place] & EventFlag.SUSPENDED))
         return any(waits) and not (len(waits) == 2 and all(waits))
 
-    def _reach(self, found: FoundDivergence, number: int, stamp: int, moved_ns: int) -> None:
-        first, count, moved = found.reached.get(number, (stamp, 0, moved_ns))
-        # Of two at one time it is the one that did not only move, whichever run is called a.
-        if (stamp, abs(moved_ns)) < (first, abs(moved)):
-            first, moved = stamp, moved_ns
-        found.reached[number] = (first, count + 1, moved)
-
     def _moved_by(self, item: EventPair) -> int:
         a, b = self._block.rows_a, self._block.rows_b
         if item.a < 0 or item.b < 0:
@@ -460,19 +465,26 @@ class Propagation:
         """Return when an item happened in whichever run had it first."""
         return self._block.stamp(item) + min(self._moved_by(item), 0)
 
-    def _moved_outputs(self, item: EventPair, differing: list[OutputRow]) -> list[OutputRow]:
-        """Return the outputs that both runs have, at another time."""
-        if not self._moved_by(item):
-            return []
-        a = self._block.rows_a
-        return list(beyond(a.outputs(item.a), differing))
-
     def _taint(self, owner: int, origin: DivergenceOrigin) -> None:
         if owner:
             self._owners.setdefault(owner, origin)
 
     def _different_outputs(self, item: EventPair) -> list[OutputRow]:
-        return outputs_of_one(self._block, item)
+        """Return ``outputs_of_one``; of a cause it was asked for before."""
+        known = self._different.get((item.a, item.b))
+        if known is None:
+            known = self._different[item.a, item.b] = outputs_of_one(self._block, item)
+        return known
+
+
+def _reach(
+    reached: dict[int, tuple[int, int, int]], number: int, stamp: int, moved_ns: int
+) -> None:
+    first, count, moved = reached.get(number, (stamp, 0, moved_ns))
+    # Of two at one time it is the one that did not only move, whichever run is called a.
+    if stamp < first or (stamp == first and abs(moved_ns) < abs(moved)):
+        first, moved = stamp, moved_ns
+    reached[number] = (first, count + 1, moved)
 
 
 def _failed(trace: Trace) -> bool:

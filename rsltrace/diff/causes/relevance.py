@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 from rsltrace.diff.alignment.entity_matching import EntityMatching
 from rsltrace.diff.alignment.rows import ComparedTrace
 from rsltrace.diff.facts.evidence import Setting, SettingKind
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import METADATA_CODE, METADATA_EDITS, METADATA_SOURCES
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.finding import GuardMode, NondeterminismSource

@@ -6,9 +6,10 @@ A style says what a piece is, not its colour; the text must do without colours.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from textwrap import wrap
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.texts import printable, shortened
 from rsltrace.trace.words.phrases import as_sentence
 

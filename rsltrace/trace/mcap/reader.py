@@ -194,14 +194,17 @@ class McapSummary:
             else:
                 self.metadata[entry.text()] = span
 
-    def chunks(self, channels: frozenset[int] | None = None) -> Iterator[ChunkIndexEntry]:
-        """Yield the chunks, or those with messages of some channels. Raises DamageError."""
-        if channels is None:
-            yield from map(parse_chunk_index, self._chunk_indexes)
-        elif channels:
+    def chunks(self) -> Iterator[ChunkIndexEntry]:
+        """Yield the chunks. Raises DamageError."""
+        yield from map(parse_chunk_index, self._chunk_indexes)
+
+    def chunk_indexes(self, channels: frozenset[int]) -> Iterator[bytes]:
+        """Yield what is said of the chunks with messages of some channels, not parsed. Raises
+        DamageError."""
+        if channels:
             for body, held in zip(self._chunk_indexes, self._held, strict=True):
                 if not channels.isdisjoint(held):
-                    yield parse_chunk_index(body)
+                    yield body
 
     @cached_property
     def _held(self) -> list[list[int]]:
