@@ -394,11 +394,11 @@ def test_a_broken_link_or_loop_is_refused() -> None:
     """Whatever is missing, or replaced while it is used, there is an error and no crash."""
     names = (
         *("subscription", "_loop", "_dispatcher", "last_ns", "send", "_delay", "_arrives"),
-        *("tasks", "idle", "scheduled", "timers", "next_place", "gate", "min_step_ns", "looks_at"),
+        *("tasks", "idle", "scheduled", "timers", "places", "gate", "min_step_ns", "looks_at"),
         *("_until_events", "_quiet_ns", "ready", "now_ns"),
     )
     for name in names:
-        for broken in (None, object(), 3, [1], [()], [(1, 2)], "x"):
+        for broken in (None, object(), 3, [1], [()], [(1, 2)], iter(()), "x"):
             for late in (False, True):
                 run = DelayedRun(4, compiled=True)  # all its links only delay
                 link: Any = (run.publishers[0].links or [])[0]
@@ -471,7 +471,7 @@ def test_a_field_that_goes_while_another_is_looked_at_is_no_crash() -> None:
         "    return run.dispatcher.event, run.loop, publisher, run.dispatcher, publisher.links[0]\n"
         "looked_at = list(enumerate(('busy_ns', 'now_ns', '_count', 'unrecorded', 'last_ns')))\n"
         "gone = [\n"
-        "    (1, 'scheduled timers now_ns events ready next_place'),\n"
+        "    (1, 'scheduled timers now_ns events ready places'),\n"
         "    (2, 'links subscriptions _count entity_id _channel'),\n"
         "    (4, 'subscription _loop _dispatcher last_ns _delay _arrives'),\n"
         "]\n"
