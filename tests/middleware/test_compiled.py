@@ -428,6 +428,22 @@ def test_a_broken_link_or_loop_is_refused() -> None:
 
 
 @needs_core
+@pytest.mark.parametrize("ties", ["creation", "heap"])
+def test_an_arrival_alone_is_not_left_to_python(ties: str) -> None:
+    run = DelayedRun(4, compiled=True)
+    loop: Any = run.loop
+    loop.timers = timer_queue(ties)
+    loop.python_next_arrival = lambda: pytest.fail("it is left to Python")
+    loop.ready.clear()
+    loop._until_events, loop._quiet_ns, loop.min_step_ns = 1000, 2**63, 0
+    for link in run.publishers[0].links or ():
+        link._delay = lambda leaves_ns: 7
+    run.publishers[0].send(b"1")
+    assert loop.scheduled
+    assert loop.next_arrival() in (*run.subscriptions, None)
+
+
+@needs_core
 def test_what_a_link_raises_comes_out_of_send() -> None:
     run = DelayedRun(4, compiled=True)
     publisher = run.publishers[0]
