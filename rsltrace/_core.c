@@ -172,10 +172,10 @@ static const uint8_t *packed_bytes(PyObject *packed, Py_ssize_t wanted) {
   return NULL;
 }
 
-/* Stores a number at the place of a row; returns whether it fits. */
-static int put(uint8_t *row, PyObject *value, size_t size) {
-  const uint64_t number = PyLong_AsUnsignedLongLong(value);
-  if (number == U64 && PyErr_Occurred()) {
+/* Stores a number at the place of a row; returns whether it fits. Written out, its size is known. */
+static inline __attribute__((always_inline)) int put(uint8_t *row, PyObject *value, size_t size) {
+  uint64_t number;
+  if (read_number(value, &number) < 0) {
     PyErr_Clear();
     return 0;
   }
@@ -232,15 +232,15 @@ static int add_record(Buffer *self, const uint8_t *header, PyObject *data, const
 static PyObject *add_payload(Buffer *self, PyObject *channel, PyObject *stamp, PyObject *data) {
   uint8_t header[HEADER] = {MESSAGE};
   PyObject *sequence, *next;
-  unsigned long long number;
+  uint64_t number;
   char *content;
   Py_ssize_t size, length;
   const Py_ssize_t place = PyNumber_AsSsize_t(channel, PyExc_IndexError);
   if (place == -1 && PyErr_Occurred()) return NULL;
   sequence = PyList_GetItem(self->sequences, place);
-  if (sequence == NULL || PyBytes_AsStringAndSize(data, &content, &size) < 0) return NULL;
-  number = PyLong_AsUnsignedLongLong(sequence);
-  if (number == U64 && PyErr_Occurred()) return NULL;
+  if (sequence == NULL || PyBytes_AsStringAndSize(data, &content, &size) < 0 ||
+      read_number(sequence, &number) < 0)
+    return NULL;
   length = size + HEADER - RECORD_HEAD;
   memcpy(header + 1, &length, 8);
   memcpy(header + 11, &number, 4);
@@ -279,9 +279,7 @@ static PyObject *buffer_add_event(Buffer *self, PyObject *const *args, Py_ssize_
   uint64_t chain_hash;
   if (check_count("add_event", count, 2, 2) < 0) return NULL;
   rest = packed_bytes(args[0], REST);
-  if (rest == NULL) return NULL;
-  chain_hash = PyLong_AsUnsignedLongLong(args[1]);
-  if (chain_hash == U64 && PyErr_Occurred()) return NULL;
+  if (rest == NULL || read_number(args[1], &chain_hash) < 0) return NULL;
   memcpy(row, &chain_hash, 8);
   memcpy(row + 8, rest, REST);
   if (add_event(self, row) < 0) return NULL;
@@ -295,8 +293,8 @@ static PyObject *buffer_add_output(Buffer *self, PyObject *packed) {
 }
 
 static int add_sequence(Buffer *self, PyObject *sequence) {
-  const unsigned long long value = PyLong_AsUnsignedLongLong(sequence);
-  if (value == U64 && PyErr_Occurred()) return -1;
+  uint64_t value;
+  if (read_number(sequence, &value) < 0) return -1;
   if (value > U32) {
     PyErr_SetString(PyExc_OverflowError, "unsigned int is greater than maximum");
     return -1;
@@ -711,17 +709,23 @@ static PyCFunction function_of(PyObject *method, int flags) {
   return PyCFunction_GetFunction(method);
 }
 
-/* Calls with one argument: directly what is built in, as a plan's methods are. */
-static PyObject *call_one(PyObject *callable, PyObject *argument) {
+/* Calls directly what is built in, as a plan's methods are. */
+PyObject *call_one(PyObject *callable, PyObject *argument) {
   const PyCFunction function = function_of(callable, METH_O);
   if (function != NULL) return function(PyCFunction_GetSelf(callable), argument);
   return PyObject_CallFunctionObjArgs(callable, argument, NULL);
 }
 
+PyObject *call_two(PyObject *callable, PyObject *first, PyObject *second) {
+  PyObject *both[] = {first, second};
+  const PyCFunction function = function_of(callable, METH_FASTCALL);
+  if (function == NULL) return PyObject_CallFunctionObjArgs(callable, first, second, NULL);
+  return ((_PyCFunctionFast)(void (*)(void))function)(PyCFunction_GetSelf(callable), both, 2);
+}
+
 static int add_one(PyObject **field) {
-  const unsigned long long value = PyLong_AsUnsignedLongLong(*field);
-  if (value == (unsigned long long)-1 && PyErr_Occurred()) return -1;
-  return set(field, PyLong_FromUnsignedLongLong(value + 1));
+  uint64_t value;
+  return read_number(*field, &value) < 0 ? -1 : set(field, PyLong_FromUnsignedLongLong(value + 1));
 }
 
 int done(PyObject *result) {
@@ -1261,7 +1265,7 @@ static PyObject *timer_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
            set(&state->last_call_ns, Py_NewRef(loop->now_ns)) < 0 ||
            set(&state->deadline_ns, Py_NewRef(next)) < 0 ||
            set(&state->ticket, Py_NewRef(entry)) < 0 ||
-           done(PyObject_CallFunctionObjArgs(heapreplace, heap, entry, NULL)) < 0 ||
+           done(call_two(heapreplace, heap, entry)) < 0 ||
            find_first(queue, heap) < 0 ||
            (cause[2] = hash_of_deadline(is_recorded, deadline)) == NULL ||
            run_callback(self, TIMER, callback, no_args, cause);

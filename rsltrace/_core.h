@@ -24,7 +24,7 @@ typedef struct {
 
 typedef struct {
   Loop of_events;
-  PyObject *tasks, *idle, *scheduled, *timers, *next_place, *gate, *min_step_ns;
+  PyObject *tasks, *idle, *scheduled, *timers, *places, *gate, *min_step_ns;
   PyObject *looks_at, *until_events, *quiet_ns;
 } WholeLoop;
 
@@ -138,7 +138,18 @@ static inline __attribute__((always_inline)) int has_fields(
 /* Replaces a field by a new object, or fails if there is none. */
 int set(PyObject **field, PyObject *value);
 
+/* Reads a number of 64 bits, or sets an error; runs no code of Python. Most have 63: that is faster. */
+static inline int read_number(PyObject *value, uint64_t *number) {
+  int overflow = 1;
+  if (PyLong_CheckExact(value)) *number = (uint64_t)PyLong_AsLongLongAndOverflow(value, &overflow);
+  if (!overflow && *number <= INT64_MAX) return 0;
+  *number = PyLong_AsUnsignedLongLong(value);
+  return *number == UINT64_MAX && PyErr_Occurred() ? -1 : 0;
+}
+
 PyObject *attribute_of(const char *module_name, const char *name);
+PyObject *call_one(PyObject *callable, PyObject *argument);
+PyObject *call_two(PyObject *callable, PyObject *first, PyObject *second);
 int done(PyObject *result);
 int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_ssize_t most);
 int append_to(PyObject *queue, PyObject *item);

@@ -14,7 +14,7 @@ PyTypeObject *loop_type;
 static PyTypeObject *link_type;
 static PyObject *link_seen;
 static PyObject *heappush, *heappop, *order_release, *minus_one;
-static PyObject *popleft_name, *send_name;
+static PyObject *send_name;
 
 FIELDS(WholeLoop, loop, "LoopFields")
 FIELDS(Link, link, "LinkFields")
@@ -28,7 +28,7 @@ PyMemberDef loop_fields[] = {
     FIELD(WholeLoop, idle, "idle"),
     FIELD(WholeLoop, scheduled, "scheduled"),
     FIELD(WholeLoop, timers, "timers"),
-    FIELD(WholeLoop, next_place, "next_place"),
+    FIELD(WholeLoop, places, "places"),
     FIELD(WholeLoop, gate, "gate"),
     FIELD(WholeLoop, min_step_ns, "min_step_ns"),
     FIELD(WholeLoop, looks_at, "looks_at"),
@@ -66,9 +66,10 @@ static PyObject *link_arrive(Link *self, PyObject *release) {
 }
 
 /* What sending reads, held, as any code of Python may replace it. */
-enum { LOOP, ENTITY_ID, RECORDER, SAMPLER, ARRIVE, NOW_NS, BUSY_NS, NEXT_PLACE, HEAP, HELD };
+enum { LOOP, ENTITY_ID, RECORDER, SAMPLER, ARRIVE, PLACES, HEAP, HELD };
 
-static int hold(Link *self, PyObject **held) {
+static int hold(Link *self, PyObject **held, uint64_t *leaves_ns) {
+  uint64_t now_ns, busy_ns;
   if (!HAS_FIELDS(self, Link, link) || !HAS_FIELDS(self->loop, WholeLoop, loop) ||
       !HAS_FIELDS(self->dispatcher, Dispatcher, dispatcher))
     return -1;
@@ -76,84 +77,69 @@ static int hold(Link *self, PyObject **held) {
   const Dispatcher *dispatcher = (Dispatcher *)self->dispatcher;
   const Event *event = (Event *)dispatcher->event;
   const Entity *to = (Entity *)self->subscription;
-  if (!HAS_FIELDS(event, Event, event)) return -1;
+  if (!HAS_FIELDS(event, Event, event) || read_number(loop->of_events.now_ns, &now_ns) < 0 ||
+      read_number(event->busy_ns, &busy_ns) < 0)
+    return -1;
   if (!is_a(self->subscription, entity_type, &subscription_seen) || to->entity_id == NULL) {
     PyErr_SetString(PyExc_TypeError, "a subscription has no id");
     return -1;
   }
+  *leaves_ns = now_ns + busy_ns;
   PyObject *all[HELD] = {
       [LOOP] = self->loop,
       [ENTITY_ID] = to->entity_id,
       [RECORDER] = dispatcher->recorder,
       [SAMPLER] = self->delay,
       [ARRIVE] = self->arrive,
-      [NOW_NS] = loop->of_events.now_ns,
-      [BUSY_NS] = event->busy_ns,
-      [NEXT_PLACE] = loop->next_place,
+      [PLACES] = loop->places,
       [HEAP] = loop->scheduled,
   };
   for (int i = 0; i < HELD; ++i) held[i] = Py_NewRef(all[i]);
   return 0;
 }
 
-/* Draws a delay; sets it and the time of the arrival, which is not before the last one. */
-static int draw_delay(Link *self, PyObject *sampler, PyObject *leaves_ns, PyObject **delay_ns,
-                      PyObject **arrival_ns) {
-  PyObject *last_ns;
-  int is_early;
-  *delay_ns = PyObject_CallFunctionObjArgs(sampler, leaves_ns, NULL);
-  if (*delay_ns == NULL || !HAS_FIELDS(self, Link, link)) return -1;
-  last_ns = Py_NewRef(self->last_ns);
-  *arrival_ns = PyNumber_Add(leaves_ns, *delay_ns);
-  is_early = *arrival_ns == NULL ? -1 : PyObject_RichCompareBool(*arrival_ns, last_ns, Py_LT);
-  if (is_early > 0 && (set(arrival_ns, Py_NewRef(last_ns)) < 0 ||
-                       set(delay_ns, PyNumber_Subtract(last_ns, leaves_ns)) < 0))
-    is_early = -1;
-  Py_DECREF(last_ns);
-  return is_early < 0 ? -1 : set(&self->last_ns, Py_NewRef(*arrival_ns));
-}
-
-static int record_delay(PyObject *recorder, PyObject *entity, PyObject *delay_ns) {
-  unsigned long long number;
-  if (recorder == Py_None) return 0;
-  number = PyLong_AsUnsignedLongLong(delay_ns);
-  if (number == (unsigned long long)-1 && PyErr_Occurred()) return -1;
-  return record_draw(recorder, entity, DELAY | number);
+/* Draws a delay. What is drawn whatever the time is an iterator (distribution.Draws). */
+static int draw(PyObject *sampler, uint64_t leaves_ns, uint64_t *delay_ns) {
+  PyObject *drawn = PyIter_Check(sampler) ? PyIter_Next(sampler)
+                                          : PyObject_CallFunction(sampler, "K", leaves_ns);
+  const int failed = drawn == NULL || read_number(drawn, delay_ns) < 0;
+  Py_XDECREF(drawn);
+  if (failed && !PyErr_Occurred()) PyErr_SetNone(PyExc_StopIteration);
+  return -failed;
 }
 
 static PyObject *release_of(PyObject *const *held, PyObject *arrival_ns,
                             PyObject *const *message) {
-  PyObject *place = PyObject_CallObject(held[NEXT_PLACE], NULL), *release;
-  if (place == NULL) return NULL;
+  PyObject *place = PyIter_Check(held[PLACES]) ? PyIter_Next(held[PLACES]) : NULL, *release;
+  if (place == NULL) {
+    if (!PyErr_Occurred()) PyErr_SetString(PyExc_TypeError, "the loop has no places");
+    return NULL;
+  }
   release = PyTuple_Pack(10, arrival_ns, order_release, place, held[ARRIVE], message[0],
                          message[1], message[2], message[3], message[4], message[5]);
   Py_DECREF(place);
   return release;
 }
 
-/* Whether a message has to wait in the loop's queue. */
-static int is_later(Link *self, PyObject *const *held, PyObject *delay_ns, PyObject *arrival_ns) {
-  PyObject *expects, *now_ns;
-  int is_it = PyObject_IsTrue(delay_ns);
-  if (is_it) return is_it;
-  if (!HAS_FIELDS(held[LOOP], WholeLoop, loop)) return -1;
-  now_ns = Py_NewRef(((Loop *)held[LOOP])->now_ns);
-  is_it = PyObject_RichCompareBool(arrival_ns, now_ns, Py_NE);
-  Py_DECREF(now_ns);
-  if (is_it) return is_it;
+/* Whether a message without a delay has to wait in the loop's queue. */
+static int is_later(Link *self, PyObject *const *held, uint64_t arrival_ns) {
+  PyObject *expects;
+  uint64_t now_ns;
+  int is_it;
+  if (!HAS_FIELDS(held[LOOP], WholeLoop, loop) ||
+      read_number(((Loop *)held[LOOP])->now_ns, &now_ns) < 0)
+    return -1;
+  if (arrival_ns != now_ns) return 1;
   expects = PyObject_CallMethod((PyObject *)self, "expects", "O", held[ARRIVE]);
   is_it = expects == NULL ? -1 : PyObject_IsTrue(expects);
   Py_XDECREF(expects);
   return is_it;
 }
 
-static int enter(Link *self, PyObject *const *held, PyObject *release, PyObject *delay_ns,
-                 PyObject *arrival_ns) {
+static int enter(Link *self, PyObject *const *held, PyObject *release, int later) {
   PyObject *receiver;
-  const int later = is_later(self, held, delay_ns, arrival_ns);
   int failed;
-  if (later)
-    return later < 0 ? -1 : done(PyObject_CallFunctionObjArgs(heappush, held[HEAP], release, NULL));
+  if (later) return later < 0 ? -1 : done(call_two(heappush, held[HEAP], release));
   receiver = link_arrive(self, release);
   if (receiver == NULL) return -1;
   failed = receiver != Py_None &&
@@ -164,21 +150,27 @@ static int enter(Link *self, PyObject *const *held, PyObject *release, PyObject 
 }
 
 static int send_plainly(Link *self, PyObject *const *message) {
-  PyObject *held[HELD], *leaves_ns, *delay_ns = NULL, *arrival_ns = NULL, *release = NULL;
+  PyObject *held[HELD], *number = NULL, *release = NULL;
+  uint64_t leaves_ns, delay_ns, arrival_ns, last_ns;
   int failed;
-  if (hold(self, held) < 0) return -1;
-  leaves_ns = PyNumber_Add(held[NOW_NS], held[BUSY_NS]);
-  failed = leaves_ns == NULL ||
-           draw_delay(self, held[SAMPLER], leaves_ns, &delay_ns, &arrival_ns) < 0 ||
-           record_delay(held[RECORDER], held[ENTITY_ID], delay_ns) < 0;
-  if (!failed) release = release_of(held, arrival_ns, message);
-  failed = release == NULL || enter(self, held, release, delay_ns, arrival_ns) < 0;
+  if (hold(self, held, &leaves_ns) < 0) return -1;
+  failed = draw(held[SAMPLER], leaves_ns, &delay_ns) < 0 || !HAS_FIELDS(self, Link, link) ||
+           read_number(self->last_ns, &last_ns) < 0;
+  if (!failed) {
+    arrival_ns = leaves_ns + delay_ns < last_ns ? last_ns : leaves_ns + delay_ns;
+    delay_ns = arrival_ns - leaves_ns;
+    number = PyLong_FromUnsignedLongLong(arrival_ns);
+    failed = set(&self->last_ns, Py_XNewRef(number)) < 0 ||
+             (held[RECORDER] != Py_None &&
+              record_draw(held[RECORDER], held[ENTITY_ID], DELAY | delay_ns) < 0);
+  }
+  if (!failed) release = release_of(held, number, message);
+  failed = release == NULL ||
+           enter(self, held, release, delay_ns ? 1 : is_later(self, held, arrival_ns)) < 0;
   Py_XDECREF(release);
-  Py_XDECREF(arrival_ns);
-  Py_XDECREF(delay_ns);
-  Py_XDECREF(leaves_ns);
+  Py_XDECREF(number);
   for (int i = 0; i < HELD; ++i) Py_DECREF(held[i]);
-  return failed ? -1 : 0;
+  return -failed;
 }
 
 static PyObject *link_send(Link *self, PyObject *const *args, Py_ssize_t count) {
@@ -246,34 +238,23 @@ static int is_next(const WholeLoop *self) {
 }
 
 static PyObject *receiver_of(PyObject *release) {
-  PyObject *function = Py_NewRef(PyTuple_GetItem(release, 3)), *owner, *receiver;
-  owner = PyCFunction_Check(function) ? PyCFunction_GetSelf(function) : NULL;
-  if (owner != NULL && is_method(function, owner, (PyCFunction)link_arrive))
-    receiver = link_arrive((Link *)owner, release);
-  else
-    receiver = PyObject_CallFunctionObjArgs(function, release, NULL);
+  PyObject *function = Py_NewRef(PyTuple_GetItem(release, 3));
+  PyObject *receiver = call_one(function, release);
   Py_DECREF(function);
   return receiver;
 }
 
 /* Whether another release is due; -1 with an error. */
-static int is_due(WholeLoop *self) {
-  PyObject *first = Py_None, *now_ns;
-  int due;
-  if (PyList_Check(self->scheduled)) {
-    if (PyList_Size(self->scheduled) == 0) return 0;
-    first = PyList_GetItem(self->scheduled, 0);
-  }
-  if (!PyTuple_Check(first) || PyTuple_Size(first) < 4) {
-    PyErr_SetString(PyExc_TypeError, "what is scheduled is no release");
+static int is_due(const WholeLoop *self) {
+  const Py_ssize_t count = PyList_Size(self->scheduled);
+  PyObject *first;
+  uint64_t first_ns, now_ns;
+  if (count <= 0) return (int)count;
+  first = PyTuple_GetItem(PyList_GetItem(self->scheduled, 0), 0);
+  if (first == NULL || read_number(first, &first_ns) < 0 ||
+      read_number(self->of_events.now_ns, &now_ns) < 0)
     return -1;
-  }
-  first = Py_NewRef(PyTuple_GetItem(first, 0));
-  now_ns = Py_NewRef(self->of_events.now_ns);
-  due = PyObject_RichCompareBool(first, now_ns, Py_LE);
-  Py_DECREF(now_ns);
-  Py_DECREF(first);
-  return due;
+  return first_ns <= now_ns;
 }
 
 /* Lets the arrival and the others of its time be dispatched in order; returns who is next. */
@@ -285,7 +266,7 @@ static PyObject *first_ready(WholeLoop *self, PyObject *receiver) {
   else if (due == 0 && (receiver != Py_None || PyObject_Size(ready) <= 0))
     first = PyErr_Occurred() ? NULL : Py_NewRef(receiver);
   else if (due == 0)
-    first = PyObject_CallMethodObjArgs(ready, popleft_name, NULL);
+    first = PyObject_CallMethod(ready, "popleft", NULL);
   Py_DECREF(ready);
   return first;
 }
@@ -297,7 +278,7 @@ static PyObject *loop_next_arrival(WholeLoop *self, PyObject *Py_UNUSED(none)) {
   if (is_it < 0) return PyObject_CallMethod((PyObject *)self, "python_next_arrival", NULL);
   if (!is_it) return Py_NewRef(Py_False);
   heap = Py_NewRef(self->scheduled);
-  release = PyObject_CallFunctionObjArgs(heappop, heap, NULL);
+  release = call_one(heappop, heap);
   Py_DECREF(heap);
   if (release == NULL) return NULL;
   if (set(&self->of_events.now_ns, Py_XNewRef(PyTuple_GetItem(release, 0))) == 0 &&
@@ -320,7 +301,6 @@ int add_loop_types(PyObject *module) {
   heappop = attribute_of("heapq", "heappop");
   order_release = PyLong_FromLong(1);
   minus_one = PyLong_FromLong(-1);
-  popleft_name = PyUnicode_InternFromString("popleft");
   send_name = PyUnicode_InternFromString("send");
   loop_type = loop_made(loop_fields, loop_methods);
   link_type = link_made(link_fields, link_methods);

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.simulation.loop.timer_queue import (
+    NEVER_NS,
     CreationOrderQueue,
     HeapOrderQueue,
     TimerState,
@@ -151,6 +152,7 @@ def test_first_is_always_a_timer_with_the_smallest_deadline(
                     inside.add(index)
                 queue.ran(first)
         first = queue.head
+        assert queue.next_ns == (NEVER_NS if first is None else first.deadline_ns)
         if not inside:
             assert first is None
         else:

@@ -394,11 +394,11 @@ def test_a_broken_link_or_loop_is_refused() -> None:
     """Whatever is missing, or replaced while it is used, there is an error and no crash."""
     names = (
         *("subscription", "_loop", "_dispatcher", "last_ns", "send", "_delay", "_arrives"),
-        *("tasks", "idle", "scheduled", "timers", "next_place", "gate", "min_step_ns", "looks_at"),
+        *("tasks", "idle", "scheduled", "timers", "places", "gate", "min_step_ns", "looks_at"),
         *("_until_events", "_quiet_ns", "ready", "now_ns"),
     )
     for name in names:
-        for broken in (None, object(), 3, [1], [()], [(1, 2)], "x"):
+        for broken in (None, object(), 3, [1], [()], [(1, 2)], iter(()), "x"):
             for late in (False, True):
                 run = DelayedRun(4, compiled=True)  # all its links only delay
                 link: Any = (run.publishers[0].links or [])[0]
@@ -425,6 +425,22 @@ def test_a_broken_link_or_loop_is_refused() -> None:
     del run.loop._quiet_ns
     with pytest.raises(AttributeError, match="_quiet_ns"):
         run.loop.next_arrival()
+
+
+@needs_core
+@pytest.mark.parametrize("ties", ["creation", "heap"])
+def test_an_arrival_alone_is_not_left_to_python(ties: str) -> None:
+    run = DelayedRun(4, compiled=True)
+    loop: Any = run.loop
+    loop.timers = timer_queue(ties)
+    loop.python_next_arrival = lambda: pytest.fail("it is left to Python")
+    loop.ready.clear()
+    loop._until_events, loop._quiet_ns, loop.min_step_ns = 1000, 2**63, 0
+    for link in run.publishers[0].links or ():
+        link._delay = lambda leaves_ns: 7
+    run.publishers[0].send(b"1")
+    assert loop.scheduled
+    assert loop.next_arrival() in (*run.subscriptions, None)
 
 
 @needs_core
@@ -471,7 +487,7 @@ def test_a_field_that_goes_while_another_is_looked_at_is_no_crash() -> None:
         "    return run.dispatcher.event, run.loop, publisher, run.dispatcher, publisher.links[0]\n"
         "looked_at = list(enumerate(('busy_ns', 'now_ns', '_count', 'unrecorded', 'last_ns')))\n"
         "gone = [\n"
-        "    (1, 'scheduled timers now_ns events ready next_place'),\n"
+        "    (1, 'scheduled timers now_ns events ready places'),\n"
         "    (2, 'links subscriptions _count entity_id _channel'),\n"
         "    (4, 'subscription _loop _dispatcher last_ns _delay _arrives'),\n"
         "]\n"

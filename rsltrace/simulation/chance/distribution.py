@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from functools import partial
+from itertools import chain
 from math import sqrt
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.chance.portable_math import exp, log
@@ -133,6 +133,14 @@ class Constant:
         return lambda now_ns: value_ns
 
 
+class Draws(chain[int]):
+    """Draws from an iterator, whatever the time. Compiled code takes what comes next itself, since
+    this is the usual jitter."""
+
+    def __call__(self, now_ns: int) -> int:
+        return next(self)
+
+
 @dataclass(frozen=True, slots=True)
 class Uniform:
     """Evenly between two bounds, both included."""
@@ -141,10 +149,8 @@ class Uniform:
     max_ns: int
 
     def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
-        values = stream.whole_numbers(self.min_ns, self.max_ns - self.min_ns + 1)
-        # No Python function, since this is the usual jitter. The present time goes where ``next``
-        # takes what to return at the end, and there is none.
-        return partial(next, values)
+        numbers = stream.whole_numbers(self.min_ns, self.max_ns - self.min_ns + 1)
+        return cast("Draws", Draws.from_iterable(numbers))
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ others unchanged, which a shared generator cannot promise.
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_right
 from collections.abc import Iterator
 from fractions import Fraction
@@ -45,12 +46,11 @@ class RandomStream:
         """Return an integer from 0 to ``count`` - 1."""
         return int(self.uniform() * count)
 
-    def whole_numbers(self, low: int, count: int) -> Iterator[int]:
-        """Yield ``low + below(count)`` forever, from the stream's beginning, twice as fast."""
-        return chain.from_iterable(
-            (np.floor(numbers * float(count)).astype(np.int64) + low).tolist()
-            for numbers in self._numbers()
-        )
+    def whole_numbers(self, low: int, count: int) -> Iterator[array[int]]:
+        """Yield ``low + below(count)`` forever, from the stream's beginning, many at a time: twice
+        as fast, and a number takes 8 bytes until it is drawn."""
+        for numbers in self._numbers():
+            yield array("q", (np.floor(numbers * float(count)).astype(np.int64) + low).tobytes())
 
     def _numbers(self) -> Iterator[npt.NDArray[np.float64]]:
         """Yield many numbers at a time, and more the more are asked for.

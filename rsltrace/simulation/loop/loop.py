@@ -105,7 +105,8 @@ class EventLoop(LoopFields):
         self._until_events = -1
         self._quiet_ns = -1
         self.scheduled: list[Release] = []
-        self.next_place = itertools.count().__next__
+        self.places = itertools.count()
+        self.next_place = self.places.__next__
 
     @property
     def stamp(self) -> Stamp:

@@ -148,7 +148,7 @@ class CreationOrderQueue(TimerQueueFields):
         return [entry[2] for entry in due], None if after is None else after[2]
 
 
-class HeapOrderQueue:
+class HeapOrderQueue(TimerQueueFields):
     """Equal deadlines in the order of libstdc++'s heap algorithms, as rclcpp uses them.
 
     rclcpp sifts up on insertion; after its root timer ran it appends the root again, pops the heap
@@ -157,6 +157,7 @@ class HeapOrderQueue:
 
     def __init__(self) -> None:
         self._heap: list[TimerState] = []
+        self._find_head()
 
     def add(self, timer: TimerState) -> None:
         if timer.ticket is self:
@@ -165,6 +166,7 @@ class HeapOrderQueue:
         timer.ticket = self
         self._heap.append(timer)
         self._sift_up(len(self._heap) - 1, 0, timer)
+        self._find_head()
 
     def remove(self, timer: TimerState) -> None:
         if timer.ticket is self:
@@ -183,14 +185,11 @@ class HeapOrderQueue:
         # push_back(front), pop_heap, pop_back: the copy at the end is what gets sifted in again.
         if len(heap) > 1:
             self._sift_down(0, len(heap), timer)
+        self._find_head()
 
-    @property
-    def head(self) -> TimerState | None:
-        return self._heap[0] if self._heap else None
-
-    @property
-    def next_ns(self) -> int:
-        return self._heap[0].deadline_ns if self._heap else NEVER_NS
+    def _find_head(self) -> None:
+        self.head = self._heap[0] if self._heap else None
+        self.next_ns = NEVER_NS if self.head is None else self.head.deadline_ns
 
     def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
         in_order = sorted(self._heap, key=lambda timer: (timer.deadline_ns, timer.order))
@@ -225,6 +224,7 @@ class HeapOrderQueue:
         length = len(self._heap)
         for parent in range((length - 2) // 2, -1, -1):
             self._sift_down(parent, length, self._heap[parent])
+        self._find_head()
 
 
 TimerQueue = CreationOrderQueue | HeapOrderQueue
