@@ -55,6 +55,25 @@ def test_texts_are_in_order_whatever_the_hash_seed(said: Callable[..., Any], way
     assert said(code)[0] == [["alpha", "bravo", "charlie", "delta", "echo"]]
 
 
+def test_subclasses_of_values_are_in_order(tmp_path: Path) -> None:
+    """As texts are: a set of ``np.str_`` is no finding."""
+    from rsltrace.job import load_job
+    from rsltrace.run import run
+
+    kinds = "np.str_, np.bytes_, type('T', (str,), {}), type('S', (str,), {'__slots__': ()})"
+    code = node_code(f"""
+import numpy as np
+for kind in ({kinds}):
+    made = [kind(c.encode() if issubclass(kind, bytes) else c) for c in "cabde"]
+    assert list({{*made}}) == sorted(made), kind
+""")
+    (tmp_path / "m.py").write_text(code)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 1.2s}\n")
+    assert [met.mode.value for met in run(load_job(tmp_path / "job.yaml"), None).guarded] == [
+        "virtual"
+    ]
+
+
 def test_numbers_keep_the_order_that_python_gives_them(said: Callable[..., Any]) -> None:
     numbers = {8, 1, 17, -3, 64}
     assert said(node_code("self.say(list({8, 1, 17, -3, 64}))"))[0] == [list(numbers)]

@@ -122,7 +122,8 @@ def sentence_of(of: Judgement) -> str:
     if isinstance(of.likely, UnrecordedAnswer):
         return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
     if isinstance(of.likely, UnguardedCall):
-        return f"{text}; possible cause: {sentence(of.likely)}, which guard: false lets differ"
+        call = sentence(of.likely)
+        return f"{text}; possible cause: {call}, which {of.likely.permission} lets differ"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
 
 
@@ -448,7 +449,8 @@ def cause_of(of: Judgement) -> str:
         text = f"{text}; {sentence(of.likely)} is not recorded (to record it, {how})"
     elif isinstance(of.likely, UnguardedCall):
         more = f" and {of.likely.more} more calls" if of.likely.more else ""
-        text = f"{text}; a possible cause is {sentence(of.likely)}{more}"
+        permission = f", which {of.likely.permission} lets differ"
+        text = f"{text}; a possible cause is {sentence(of.likely)}{more}{permission}"
     elif isinstance(of.likely, ErrorInTransition):
         text = f"{sentence(of.likely)}; {text}"
     elif of.likely is not None:
