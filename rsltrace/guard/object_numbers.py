@@ -29,7 +29,7 @@ _PARTS_MAX = 500
 _CHARACTERS_MAX = 1000
 _ARRAY_BYTES_MAX = 1 << 16
 _PLAIN = (str, bytes, int, float, bool, complex, type(None))
-_VALUES = (str, bytes, int, float, complex)
+_VALUES: tuple[Any, ...] = (str, bytes, int, float, complex)
 """Python's values, of which there are subclasses: ``np.str_``, ``np.float64``."""
 _GENERIC = (types.GenericAlias, types.UnionType)
 _FRAMES = {types.GeneratorType: "gi_frame", types.CoroutineType: "cr_frame"}

@@ -95,6 +95,21 @@ def test_a_set_of_objects_is_a_finding(tmp_path: Path) -> None:
     assert [(met.call, met.count) for met in result.guarded] == [("order of a set of object", 2)]
 
 
+def test_temporary_name_that_an_earlier_run_left(tmp_path: Path) -> None:
+    """The first run asks for nothing from outside; the next finds the name taken and says so."""
+    from rsltrace.job import load_job
+    from rsltrace.run import run
+
+    (tmp_path / "m.py").write_text(
+        node_code(f"import tempfile\nself.say(tempfile.mkdtemp(dir={str(tmp_path)!r}))")
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 0.7s}\n")
+    first, second = (run(load_job(tmp_path / "job.yaml"), None) for _ in range(2))
+    assert [met.call for met in first.guarded if met.mode.value == "warn"] == []
+    (taken,) = [met for met in second.guarded if met.mode.value == "warn"]
+    assert taken.call.startswith(f"the taken name '{tmp_path}/tmp")
+
+
 def test_what_is_rewritten_means_the_same() -> None:
     """Whole modules of Python's own, rewritten, still do what their tests say."""
     source = '''

@@ -170,7 +170,7 @@ def _set_behind(
     calls_there = _audited_calls(run, view, (NondeterminismSource.ORDER,))
     if calls_there is None:
         return None
-    (_, place, what), *more = calls_there
+    (_, place, what, _), *more = calls_there
     return SetOrder(what, place, len(more))
 
 
@@ -209,16 +209,18 @@ def _audited_calls(
         return None
     module = place.rpartition(":")[0]
     lines = _audited_lines(*found, sources)
-    return [(str(found[0]), f"{module}:{line}", *called) for line, *called in lines] or None
+    return [(str(found[0]), f"{module}:{line}", *called) for line, called in lines] or None
 
 
-def _audited_lines(file: Path, line: int, sources: Collection[str]) -> list[tuple[int, str, str]]:
+def _audited_lines(
+    file: Path, line: int, sources: Collection[str]
+) -> list[tuple[int, tuple[str, str]]]:
     """Return where a file makes nondeterministic calls of some sources: in the function at a line,
     or else anywhere."""
     from rsltrace.guard.audit.audit import audit_path  # most diffs do not need it
 
     try:
-        found = [(o.line, o.call, o.kind) for o in audit_path(file).found if o.kind in sources]
+        found = [(o.line, (o.call, o.kind)) for o in audit_path(file).found if o.kind in sources]
         tree = ast.parse(file.read_bytes())
     except (JobError, OSError, SyntaxError, ValueError):
         return []
