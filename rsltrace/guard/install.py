@@ -176,8 +176,9 @@ class _RandomFileNames(_tempfile._RandomNameSequence):  # type: ignore[misc]
 
 
 class _FileNameSequence:
-    """Replaces ``tempfile``'s sequence of random names: each node has its own. That a name is taken,
-    by a file that an earlier run has left, is a finding: this run uses another name."""
+    """Replaces ``tempfile``'s sequence of random names: each node has its own.
+
+    That a name is taken, by what an earlier run has left, is a finding: this run uses another."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
