@@ -245,6 +245,23 @@ def test_timeout_of_a_call(tmp_path: Path) -> None:
         assert f" slept 250 ms in {run} but not in " in found.sentence
 
 
+def test_sleep_of_overlapping_callbacks(tmp_path: Path) -> None:
+    """Whichever of them wakes up first: that one waits is said, not for how long."""
+    group = "callback_group=ReentrantCallbackGroup()"
+    overlapping = (
+        (
+            "import time\n",
+            "import time\nfrom rclpy.callback_groups import ReentrantCallbackGroup\n",
+        ),
+        ("self.tick)", f"self.tick, {group})"),
+        ("        self.out.publish(UInt64(data=self.count))", "        pass"),
+    )
+    a = recorded(tmp_path, "a.mcap", *overlapping)
+    b = recorded(tmp_path, "b.mcap", *overlapping, ("        pass", "        time.sleep(0.15)"))
+    for found, run in zip(both_ways(a, b), "ba", strict=True):
+        assert f"received the same input in both runs but waited only in {run}" in found.sentence
+
+
 def test_delays_that_differ_in_the_seventh_digit(tmp_path: Path) -> None:
     """In the setting, in the draw and in the report's table."""
     delay = "delay: {{topics: {{/signal: {}}}}}\n"
