@@ -7,6 +7,7 @@ import datetime
 import hashlib
 import os
 import platform
+import random
 import re
 import resource
 import sys
@@ -15,7 +16,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar, Token
-from functools import partial
+from functools import cached_property, partial
 from types import (
     AsyncGeneratorType,
     BuiltinMethodType,
@@ -166,8 +167,18 @@ _PLATFORM_CACHES: dict[str, tuple[str, Callable[[], object]]] = {
 """Functions of ``platform``, the name of each one's cache, and its initial value."""
 
 
+class _RandomFileNames(_tempfile._RandomNameSequence):  # type: ignore[misc]
+    """One node's names. Does not ask for the process id, which would be a finding."""
+
+    @cached_property
+    def rng(self) -> random.Random:
+        return random.Random()
+
+
 class _FileNameSequence:
-    """Replaces ``tempfile``'s sequence of random names: each node has its own."""
+    """Replaces ``tempfile``'s sequence of random names: each node has its own.
+
+    That a name is taken, by what an earlier run has left, is a finding: this run uses another."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
@@ -181,10 +192,13 @@ class _FileNameSequence:
             if self._real is None:
                 self._real = _tempfile._RandomNameSequence()
             return str(next(self._real))
-        names = guard.streams.file_names
-        stream = guard.stream(sys._getframe(1))
+        names, frame = guard.streams.file_names, sys._getframe(1)
+        if frame.f_locals.get("seq"):
+            call = f"the taken name {frame.f_locals.get('file')!r}"
+            guard.report_user_call(NondeterminismSource.FILE, call, True, frame)
+        stream = guard.stream(frame)
         if stream not in names:
-            names[stream] = _tempfile._RandomNameSequence()
+            names[stream] = _RandomFileNames()
         return str(next(names[stream]))
 
 

@@ -29,6 +29,8 @@ _PARTS_MAX = 500
 _CHARACTERS_MAX = 1000
 _ARRAY_BYTES_MAX = 1 << 16
 _PLAIN = (str, bytes, int, float, bool, complex, type(None))
+_VALUES: tuple[Any, ...] = (str, bytes, int, float, complex)
+"""Python's values, of which there are subclasses: ``np.str_``, ``np.float64``."""
 _GENERIC = (types.GenericAlias, types.UnionType)
 _FRAMES = {types.GeneratorType: "gi_frame", types.CoroutineType: "cr_frame"}
 """Types of running code, and the attribute with their variables."""
@@ -100,6 +102,10 @@ class ObjectNumbers:
             parts.append(f"{kind.__name__} {start!r}")
             if start is not obj:
                 parts.append(str(len(obj)))
+        elif isinstance(obj, _VALUES) and not isinstance(obj, enum.Enum):
+            parts.append(f"{kind.__module__}.{kind.__qualname__}")
+            value = next(base for base in _VALUES if isinstance(obj, base))
+            self._describe(value.__getnewargs__(obj), parts, depth + 1)
         elif kind is types.MethodType:
             parts.append(f"method {obj.__func__.__qualname__}")
             self._describe(obj.__self__, parts, depth + 1)

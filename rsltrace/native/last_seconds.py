@@ -26,6 +26,7 @@ from rsltrace.native.span_recorder import (
     now_ns,
 )
 from rsltrace.native.span_writer import SpanSource
+from rsltrace.simulation.middleware.events.failure import as_printed
 from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import EventKind, OutputKind
@@ -102,7 +103,7 @@ def _sent(span: CallbackSpan) -> Iterator[SentOutput]:
         elif isinstance(one, EmittedLog):
             yield SentOutput(int(OutputKind.LOG), TOPIC_ROSOUT, 0, one.text, one.severity)
         elif isinstance(one, CallbackError):
-            yield SentOutput(int(OutputKind.EXCEPTION), "", 0, f"{one.kind}: {one.said}")
+            yield SentOutput(int(OutputKind.EXCEPTION), "", 0, as_printed(one.kind, one.said))
 
 
 def _message(sent: SentMessage, data: bytes) -> object:

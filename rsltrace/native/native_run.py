@@ -32,7 +32,7 @@ from rsltrace.run.stop_rules import (
 )
 from rsltrace.simulation.loop.policy import PriorityRule
 from rsltrace.simulation.loop.stop import Progress, Stop
-from rsltrace.simulation.middleware.events.failure import exception_text
+from rsltrace.simulation.middleware.events.failure import as_printed, exception_text
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_NATIVE
 from rsltrace.trace.mcap.sink import unfinished_path
 from rsltrace.trace.model.texts import format_seconds
@@ -335,7 +335,7 @@ class NativeRun:
         reason = f"{what} raised {kind}"
         stamp_ns = self.clocks.stamp(time.monotonic_ns())
         error = NodeError(
-            f"{reason}: {said}",
+            f"{what} raised {as_printed(kind, said)}",
             node=node,
             entity=entry,
             stamp_ns=stamp_ns,

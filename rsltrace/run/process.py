@@ -196,6 +196,7 @@ def search_path(job: Job, *, native: bool = False) -> Iterator[None]:
                     forget_interfaces()
     finally:
         sys.path[:] = old_path
+        COPIED_FILES.clear()
         for name in {*user_modules(folders), *_namespaces(folders)} - old_modules:
             del sys.modules[name]
 
@@ -240,6 +241,10 @@ def _path_of(module: object) -> list[str]:
     with suppress(KeyError):  # its parent is gone
         return [one for one in path or () if isinstance(one, str)]
     return []
+
+
+COPIED_FILES: dict[str, str] = {}
+"""Files of modules of which mains have copies of their own, which ``sys.modules`` does not show."""
 
 
 def user_modules(folders: list[str]) -> dict[str, Path]:

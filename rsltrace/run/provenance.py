@@ -21,7 +21,7 @@ from rsltrace.guard.callers import is_rsltrace_module, is_user_file
 from rsltrace.guard.pin import HASH_SEED, import_threadpoolctl
 from rsltrace.job import Job
 from rsltrace.job.values.target import Target
-from rsltrace.run.process import is_below, is_pytest_module, run_as_main, user_modules
+from rsltrace.run.process import COPIED_FILES, is_below, is_pytest_module, run_as_main, user_modules
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
     METADATA_CODE,
@@ -187,9 +187,10 @@ def source_files(job: Job) -> dict[str, Path]:
     """
     folders = [str(job.resolve(folder)) for folder in job.search_path]
     of_nodes = {_module_of(target) for spec in job.nodes for target in (spec.node, spec.main)}
+    copied = {name: Path(file) for name, file in COPIED_FILES.items() if is_below(file, folders)}
     modules = {
         name: path
-        for name, path in user_modules(folders).items()
+        for name, path in {**copied, **user_modules(folders)}.items()
         if name in of_nodes or not is_pytest_module(name)
     }
     modules.update(_run_as_main(job, folders))

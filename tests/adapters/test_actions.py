@@ -47,6 +47,9 @@ class Server(Node):
             feedback.sequence.append(feedback.sequence[-1] + feedback.sequence[-2])
             goal.publish_feedback(feedback)
         goal.succeed()
+        told = "Failed to update goal state: .* transition from state SUCCEEDED with event ABORT"
+        with pytest.raises(RuntimeError, match=told):
+            goal.abort()
         return Fibonacci.Result(sequence=feedback.sequence)
 
 

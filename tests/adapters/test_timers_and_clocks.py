@@ -87,6 +87,10 @@ def test_cancel_reset_and_change_of_period(simulate: Any) -> None:
                 self.timer.cancel()
                 assert self.timer.is_canceled()
                 assert self.timer.time_until_next_call() is None
+                with pytest.raises(RuntimeError, match="failed to call timer: timer is canceled"):
+                    self.timer.handle.call_timer()
+                with pytest.raises(RuntimeError, match="failed to create timer: timer period must"):
+                    self.create_timer(-1.0, self.tick)
 
         def middle(self) -> None:
             if len(seen) == 2:

@@ -161,17 +161,25 @@ def test_exception_that_a_setting_provokes_and_rclpy_suppresses(tmp_path: Path) 
         assert found.sentence.endswith(f" only in {run}; rclpy suppressed it")
 
 
-def test_call_that_no_guard_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With guard: false, the call in the callback is named, and the command that lists all."""
+@pytest.mark.parametrize(
+    "permission",
+    ["guard: false", "guard: {clock: allow}", "guard: {clock: {allow: [headline_source]}}"],
+    ids=["all", "source", "module"],
+)
+def test_call_that_the_job_permits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, permission: str
+) -> None:
+    """The call in the callback is named, and the command that lists all."""
     monkeypatch.chdir(tmp_path)
     timed = ("data=self.count", "data=time.time_ns()")
-    off = (STOP, "guard: false\n" + STOP)
+    off = (STOP, f"{permission}\n{STOP}")
     a, b = (recorded(tmp_path, f"{name}.mcap", timed, off) for name in "ab")
     line = SOURCE.splitlines().index("        self.out.publish(UInt64(data=self.count))") + 1
     call = f"time.time_ns() at headline_source.py:{line}"
     for found in both_ways(a, b):
-        assert f"; possible cause: {call}, which guard: false lets differ" in found.sentence
-        assert f"; a possible cause is {call}" in found.divergences[0].root_sentence
+        assert f"; possible cause: {call}, which {permission} lets differ" in found.sentence
+        root = found.divergences[0].root_sentence
+        assert f"; a possible cause is {call}, which {permission} lets differ" in root
         assert found.divergences[0].next_step == "rsltrace audit headline_source.py"
 
 
@@ -235,6 +243,23 @@ def test_timeout_of_a_call(tmp_path: Path) -> None:
     b = recorded(tmp_path, "b.mcap", *client, ("timeout_sec=1.0", "timeout_sec=0.2"))
     for found, run in zip(both_ways(a, b), "ab", strict=True):
         assert f" slept 250 ms in {run} but not in " in found.sentence
+
+
+def test_sleep_of_overlapping_callbacks(tmp_path: Path) -> None:
+    """Whichever of them wakes up first: that one waits is said, not for how long."""
+    group = "callback_group=ReentrantCallbackGroup()"
+    overlapping = (
+        (
+            "import time\n",
+            "import time\nfrom rclpy.callback_groups import ReentrantCallbackGroup\n",
+        ),
+        ("self.tick)", f"self.tick, {group})"),
+        ("        self.out.publish(UInt64(data=self.count))", "        pass"),
+    )
+    a = recorded(tmp_path, "a.mcap", *overlapping)
+    b = recorded(tmp_path, "b.mcap", *overlapping, ("        pass", "        time.sleep(0.15)"))
+    for found, run in zip(both_ways(a, b), "ba", strict=True):
+        assert f"received the same input in both runs but waited only in {run}" in found.sentence
 
 
 def test_delays_that_differ_in_the_seventh_digit(tmp_path: Path) -> None:

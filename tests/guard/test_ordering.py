@@ -55,6 +55,25 @@ def test_texts_are_in_order_whatever_the_hash_seed(said: Callable[..., Any], way
     assert said(code)[0] == [["alpha", "bravo", "charlie", "delta", "echo"]]
 
 
+def test_subclasses_of_values_are_in_order(tmp_path: Path) -> None:
+    """As texts are: a set of ``np.str_`` is no finding."""
+    from rsltrace.job import load_job
+    from rsltrace.run import run
+
+    kinds = "np.str_, np.bytes_, type('T', (str,), {}), type('S', (str,), {'__slots__': ()})"
+    code = node_code(f"""
+import numpy as np
+for kind in ({kinds}):
+    made = [kind(c.encode() if issubclass(kind, bytes) else c) for c in "cabde"]
+    assert list({{*made}}) == sorted(made), kind
+""")
+    (tmp_path / "m.py").write_text(code)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 1.2s}\n")
+    assert [met.mode.value for met in run(load_job(tmp_path / "job.yaml"), None).guarded] == [
+        "virtual"
+    ]
+
+
 def test_numbers_keep_the_order_that_python_gives_them(said: Callable[..., Any]) -> None:
     numbers = {8, 1, 17, -3, 64}
     assert said(node_code("self.say(list({8, 1, 17, -3, 64}))"))[0] == [list(numbers)]
@@ -74,6 +93,21 @@ def test_a_set_of_objects_is_a_finding(tmp_path: Path) -> None:
     (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 1.2s}\n")
     result = run(load_job(tmp_path / "job.yaml"), None)
     assert [(met.call, met.count) for met in result.guarded] == [("order of a set of object", 2)]
+
+
+def test_temporary_name_that_an_earlier_run_left(tmp_path: Path) -> None:
+    """The first run asks for nothing from outside; the next finds the name taken and says so."""
+    from rsltrace.job import load_job
+    from rsltrace.run import run
+
+    (tmp_path / "m.py").write_text(
+        node_code(f"import tempfile\nself.say(tempfile.mkdtemp(dir={str(tmp_path)!r}))")
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 0.7s}\n")
+    first, second = (run(load_job(tmp_path / "job.yaml"), None) for _ in range(2))
+    assert [met.call for met in first.guarded if met.mode.value == "warn"] == []
+    (taken,) = [met for met in second.guarded if met.mode.value == "warn"]
+    assert taken.call.startswith(f"the taken name '{tmp_path}/tmp")
 
 
 def test_what_is_rewritten_means_the_same() -> None:

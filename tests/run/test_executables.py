@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from rsltrace.trace.format import METADATA_SOURCES
+from rsltrace.trace.reader import Trace
 from tests.tiers import cases
 
 PACKAGE = """
@@ -167,6 +169,26 @@ def test_executables_of_packages_run_with_the_jobs_names_and_parameters(
         "second: bye",
     ]
     assert result.notes == ("my_scripts/scripted ended at 1.000000000 s",)
+
+
+def test_sources_of_every_main_of_a_package(
+    record_yaml: Callable[[str], Any], workspace: Path
+) -> None:
+    """Each main imports its package for itself; the trace has the hashes of all their modules."""
+    package = workspace / "shared"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "helper.py").touch()
+    (package / "one.py").write_text(f"{PACKAGE}main = listener\n")
+    (package / "two.py").write_text("from shared import helper\nfrom shared.one import talker\n")
+    result = record_yaml("nodes: [{main: 'shared.one:main'}, {main: 'shared.two:talker'}]\n")
+    with Trace.open(result.path) as trace:
+        assert [*trace.metadata(METADATA_SOURCES)] == [
+            "shared",
+            "shared.helper",
+            "shared.one",
+            "shared.two",
+        ]
 
 
 def test_arguments_that_were_looked_at_on_import_are_those_of_the_main(

@@ -153,6 +153,12 @@ def test_a_run_ends_when_nothing_is_left_to_do(record_job: Any) -> None:
     assert result.end_ns == 0
 
 
+def test_exception_without_a_text(record_job: Any) -> None:
+    code = "class Faulty(Talker):\n    def tick(self):\n        raise AssertionError\n"
+    result = record_job("nodes: [{node: nodes_under_test:Faulty}]\n", code)
+    assert str(result.error).endswith(" s raised AssertionError")
+
+
 @pytest.mark.long
 def test_an_exception_names_node_entity_and_time_and_the_trace_is_complete(
     record_job: Any, tmp_path: Path
@@ -209,7 +215,7 @@ def test_a_constructor_that_raises_is_named(record_job: Any) -> None:
         ("no_such_module:Talker", ["job.yaml:1:16: ", "no module 'no_such_module'"]),
         ("nodes_under_test:Tolker", ["job.yaml:1:16: ", "'Tolker'", "did you mean 'Talker'"]),
         ("nodes_under_test:TALL", ["not callable"]),
-        ("nodes_under_test:something", ["returned a int, not an rclpy Node"]),
+        ("nodes_under_test:something", ["returned an object of type int, not an rclpy Node"]),
     ],
 )
 def test_what_cannot_be_constructed_is_explained(

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from rsltrace.guard.virtual import set_order
-from rsltrace.simulation.middleware.events.failure import exception_text
+from rsltrace.simulation.middleware.events.failure import as_printed, exception_text
 
 
 def is_unmade(value: object) -> bool:
@@ -94,7 +94,7 @@ def import_raised(module: str, error: BaseException, said: str) -> str:
         said = error.msg
     else:
         place, line = _last_line(error.__traceback__)
-    said = f"{type(error).__qualname__}: {said}".removesuffix(": ")
+    said = as_printed(type(error).__qualname__, said)
     hint = ""
     if isinstance(error, SystemExit):
         hint = (

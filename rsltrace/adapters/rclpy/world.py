@@ -225,8 +225,8 @@ class World:
 
         if not isinstance(node, Node):
             raise JobError(
-                f"{name} returned a {type(node).__qualname__}, not an rclpy Node: name a Node "
-                "subclass or a function that returns a node (or a list of nodes)"
+                f"{name} returned an object of type {type(node).__qualname__}, not an rclpy Node: "
+                "name a Node subclass or a function that returns a node (or a list of nodes)"
             )
         if is_unmade(node):
             raise RunError(f"{constructor_of(node)} has not called super().__init__(name)")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
@@ -86,9 +86,7 @@ def likely_cause(
         return properties
     if not judgement.is_unexplained:
         return None
-    if relevance.guard_is_off:
-        return _unguarded_call(run, view)
-    return unrecorded_answer(run, view)
+    return _unguarded_call(run, view, relevance.permissions) or unrecorded_answer(run, view)
 
 
 def suppressed_exception(
@@ -169,21 +167,23 @@ def _set_behind(
             return SetOrder(call.call, call.where.partition(" in ")[0])
     if relevance.sets_are_in_order:
         return None
-    calls_there = _audited_calls(run, view, of_sets=True)
+    calls_there = _audited_calls(run, view, (NondeterminismSource.ORDER,))
     if calls_there is None:
         return None
-    (_, place, what), *more = calls_there
+    (_, place, what, _), *more = calls_there
     return SetOrder(what, place, len(more))
 
 
-def _unguarded_call(run: ComparedTrace, view: EventSummary) -> UnguardedCall | None:
-    """Return the first call in the code of an event whose answer a run without a guard takes from
+def _unguarded_call(
+    run: ComparedTrace, view: EventSummary, permissions: dict[str, str]
+) -> UnguardedCall | None:
+    """Return the first call in the code of an event whose answer the jobs permit to be from
     outside; None if there is none, or the code is not here."""
-    found = _audited_calls(run, view, of_sets=False)
+    found = _audited_calls(run, view, permissions) if permissions else None
     if found is None:
         return None
-    (file, place, call), *more = found
-    return UnguardedCall(call, place, file, len(more))
+    (file, place, call, source), *more = found
+    return UnguardedCall(call, place, file, permissions[source], len(more))
 
 
 def _is_reordered(message: MessageDifference) -> bool:
@@ -199,30 +199,28 @@ def _is_as_recorded(run: ComparedTrace, file: Path) -> bool:
 
 
 def _audited_calls(
-    run: ComparedTrace, view: EventSummary, *, of_sets: bool
-) -> list[tuple[str, str, str]] | None:
-    """Return what an audit finds in the code of an event: file, place and call; None for nothing,
-    or if the code is not here as it was recorded."""
+    run: ComparedTrace, view: EventSummary, sources: Collection[str]
+) -> list[tuple[str, str, str, str]] | None:
+    """Return what an audit finds of some sources in the code of an event: file, place, call and
+    source; None for nothing, or if the code is not here as it was recorded."""
     place = code_place(run.trace, run.trace.event(view.index))
     found = code_file(run.trace, place)
     if found is None or not _is_as_recorded(run, found[0]):
         return None
     module = place.rpartition(":")[0]
-    lines = _audited_lines(*found, of_sets=of_sets)
-    return [(str(found[0]), f"{module}:{line}", call) for line, call in lines] or None
+    lines = _audited_lines(*found, sources)
+    return [(str(found[0]), f"{module}:{line}", *called) for line, called in lines] or None
 
 
-def _audited_lines(file: Path, line: int, *, of_sets: bool) -> list[tuple[int, str]]:
-    """Return where a file goes through sets, or calls something nondeterministic: in the function
-    at a line, or else anywhere."""
+def _audited_lines(
+    file: Path, line: int, sources: Collection[str]
+) -> list[tuple[int, tuple[str, str]]]:
+    """Return where a file makes nondeterministic calls of some sources: in the function at a line,
+    or else anywhere."""
     from rsltrace.guard.audit.audit import audit_path  # most diffs do not need it
 
     try:
-        found = [
-            (o.line, o.call)
-            for o in audit_path(file).found
-            if (o.kind == NondeterminismSource.ORDER.value) is of_sets
-        ]
+        found = [(o.line, (o.call, o.kind)) for o in audit_path(file).found if o.kind in sources]
         tree = ast.parse(file.read_bytes())
     except (JobError, OSError, SyntaxError, ValueError):
         return []

@@ -236,6 +236,22 @@ class Relevance:
         return not all(map(_is_guarded, self._jobs))
 
     @cached_property
+    def permissions(self) -> dict[str, str]:
+        """What in the jobs lets the answers of a source differ, by source."""
+        found: dict[str, str] = {}
+        parts = (part for job in self._jobs for part in (job, *(job.get("nodes") or [])))
+        for guard in filter(None, (_value(part, "guard") for part in parts)):
+            for source in (one.value for one in NondeterminismSource):
+                if _value(guard, "enabled") is False:
+                    found[source] = "guard: false"
+                elif _value(guard, source, "mode") == GuardMode.ALLOW:
+                    found.setdefault(source, f"guard: {{{source}: allow}}")
+                elif modules := _value(guard, source, "allow"):
+                    modules = ", ".join(map(str, modules))
+                    found.setdefault(source, f"guard: {{{source}: {{allow: [{modules}]}}}}")
+        return found
+
+    @cached_property
     def sets_are_in_order(self) -> bool:
         """Whether both runs went through sets in an order that does not change."""
         return all(

@@ -378,11 +378,12 @@ class UnrecordedAnswer(Fact):
 @dataclass(frozen=True, slots=True)
 class UnguardedCall(Fact):
     """A call in the code that ran, which no guard watched: a possible cause. ``file`` has it, and
-    ``more`` such calls."""
+    ``more`` such calls; ``permission`` is what the job says (``guard: false``)."""
 
     call: str
     place: str
     file: str
+    permission: str
     more: int = 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from rsltrace.diff.facts.causes import (
@@ -44,7 +43,6 @@ from rsltrace.diff.facts.evidence import (
     EntityChanges,
     EntityProperty,
     EventSummary,
-    MessageDifference,
     Presence,
 )
 from rsltrace.diff.sentences import SENTENCES, says, sentence
@@ -63,6 +61,7 @@ from rsltrace.diff.sentences.values import (
 )
 from rsltrace.trace.model.event import (
     NO_EVENT,
+    EventFlag,
     EventKind,
     OutputKind,
     RandomDecision,
@@ -122,7 +121,8 @@ def sentence_of(of: Judgement) -> str:
     if isinstance(of.likely, UnrecordedAnswer):
         return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
     if isinstance(of.likely, UnguardedCall):
-        return f"{text}; possible cause: {sentence(of.likely)}, which guard: false lets differ"
+        call = sentence(of.likely)
+        return f"{text}; possible cause: {call}, which {of.likely.permission} lets differ"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
 
 
@@ -156,7 +156,7 @@ def _(what: DivergenceKind, of: Judgement) -> str:
 
 @says(DivergenceKind.OTHER_CONSTRUCTION, DivergenceKind.OTHER_CONSTRUCTION_SAME_JOB)
 def _(what: DivergenceKind, of: Judgement) -> str:
-    text = f"{phrase(_one(of))} {_did(of.messages)}"
+    text = f"{phrase(_one(of))} {_did(of)}"
     same = what is DivergenceKind.OTHER_CONSTRUCTION_SAME_JOB
     return f"{text}, in the same job and environment" if same else text
 
@@ -320,7 +320,7 @@ def _(what: DifferentOutput, of: Judgement) -> str:
     if what.slept is not None and what.only_slept:
         text = f"{_at(one)} {slept_text(what.slept)}{differs}"
     else:
-        text = f"{_received(one)} {_did(of.messages)}"
+        text = f"{_received(one)} {_did(of)}"
         text += f", and {slept_text(what.slept)}" if what.slept is not None else ""
     return text
 
@@ -343,9 +343,9 @@ def _received(one: EventSummary, joint: str = "but") -> str:
 _CALLED_FOR = (EventKind.SUBSCRIPTION, EventKind.SERVICE)
 
 
-def _did(messages: Sequence[MessageDifference]) -> str:
+def _did(of: Judgement) -> str:
     """Return what a callback did: ``published a different /push (data 1 → 2)``."""
-    outputs = [message for message in messages if not message.is_input]
+    outputs = [message for message in of.messages if not message.is_input]
     if len(outputs) == 1 and outputs[0].kind is OutputKind.MESSAGE:
         (one,) = outputs
         if one.presence is Presence.BOTH and one.fate is None:
@@ -353,7 +353,11 @@ def _did(messages: Sequence[MessageDifference]) -> str:
             return f"published a different {one.topic}{f' ({values})' if values else ''}"
         if one.fate is None:
             return f"published {one.topic} {IN_ONE[one.presence]}"
-    return f"behaved differently{what_differs(messages)}"
+    if not outputs and of.a is not None and of.b is not None:
+        a, b = (bool(one.flags & EventFlag.SUSPENDED) for one in (of.a, of.b))
+        if a is not b:
+            return f"waited only in {'a' if a else 'b'}"
+    return f"behaved differently{what_differs(of.messages)}"
 
 
 @says(EarlierEnd)
@@ -448,7 +452,8 @@ def cause_of(of: Judgement) -> str:
         text = f"{text}; {sentence(of.likely)} is not recorded (to record it, {how})"
     elif isinstance(of.likely, UnguardedCall):
         more = f" and {of.likely.more} more calls" if of.likely.more else ""
-        text = f"{text}; a possible cause is {sentence(of.likely)}{more}"
+        permission = f", which {of.likely.permission} lets differ"
+        text = f"{text}; a possible cause is {sentence(of.likely)}{more}{permission}"
     elif isinstance(of.likely, ErrorInTransition):
         text = f"{sentence(of.likely)}; {text}"
     elif of.likely is not None:

@@ -38,6 +38,7 @@ from rsltrace.native.support import check_loopback, domain
 from rsltrace.run.plans.entries import missed_starts
 from rsltrace.run.stop_rules import has_stop
 from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.middleware.events.failure import as_printed
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
@@ -399,7 +400,9 @@ class MultiProcessRun(NativeRun):
         child.has_failed = True
         if child.is_stopping:
             if kind not in _QUIET_ENDS:
-                self.notes.append(f"{child.what.name}, told to end, raised {kind}: {said}")
+                self.notes.append(
+                    f"{child.what.name}, told to end, raised {as_printed(kind, said)}"
+                )
             return
         self.raised(what, child.what.name, node, kind, said, traceback)
 

@@ -34,7 +34,7 @@ from rsltrace.guard.virtual.user_modules import code_of_script
 from rsltrace.job import Job, NodeSpec
 from rsltrace.job.reading.substitute import installed_prefixes
 from rsltrace.run.plans.scheduling import load_target
-from rsltrace.run.process import run_as_main, user_modules
+from rsltrace.run.process import COPIED_FILES, run_as_main, user_modules
 from rsltrace.simulation.middleware.events.failure import exception_text
 from rsltrace.trace.model.regular_file import read_regular
 
@@ -220,8 +220,10 @@ def _imported_again(package: str) -> Iterator[None]:
     try:
         yield
     finally:
-        for name in modules():
+        for name, module in modules().items():
             del sys.modules[name]
+            if isinstance(file := getattr(module, "__file__", None), str):
+                COPIED_FILES[name] = file
         sys.modules.update(before)
 
 

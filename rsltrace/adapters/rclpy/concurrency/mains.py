@@ -22,7 +22,7 @@ from rsltrace.adapters.rclpy.concurrency.program import ExitHandler, SimulatedPr
 from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, RunEnded, Runtime
 from rsltrace.adapters.rclpy.concurrency.threads import SimThread
 from rsltrace.simulation.loop.stop import Stop
-from rsltrace.simulation.middleware.events.failure import exception_text
+from rsltrace.simulation.middleware.events.failure import as_printed, exception_text
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds
 
@@ -213,10 +213,8 @@ def _note_main_end(
         return False
     if over:
         if not isinstance(error, KeyboardInterrupt) and not _is_external_shutdown(error):
-            kind = type(error).__qualname__
-            notes.append(
-                f"{program.label} raised {kind} at the end of the run: {exception_text(error)}"
-            )
+            raised = as_printed(type(error).__qualname__, exception_text(error))
+            notes.append(f"{program.label} raised at the end of the run: {raised}")
         return False
     return True
 

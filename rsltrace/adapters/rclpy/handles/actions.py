@@ -27,6 +27,7 @@ from rsltrace.trace.model.event import NO_EVENT, EventKind
 
 # Numbers of action_msgs/msg/GoalStatus. The state machine of a goal is rcl_action's (ROS 2 Jazzy).
 ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = 1, 2, 3, 4, 5, 6
+_STATES = ("UNKNOWN", "ACCEPTED", "EXECUTING", "CANCELING", "SUCCEEDED", "CANCELED", "ABORTED")
 _TRANSITIONS = {
     (ACCEPTED, "EXECUTE"): EXECUTING,
     (ACCEPTED, "CANCEL_GOAL"): CANCELING,
@@ -50,7 +51,7 @@ class GoalHandle(Handle):
         super().__init__()
         goal_id = bytes(info.goal_id.uuid)
         if goal_id in goals:
-            raise real.RCLError("goal ID already exists")
+            raise real.RCLError("Failed to accept new goal: goal ID already exists")
         self._real = real
         self.info = info
         self.status = ACCEPTED
@@ -75,8 +76,8 @@ class GoalHandle(Handle):
         state = _TRANSITIONS.get((self.status, event.name))
         if state is None:
             raise self._real.RCLError(
-                f"goal_handle attempted invalid transition from state {self.status} "
-                f"with event {event.name}"
+                "Failed to update goal state: goal_handle attempted invalid transition "
+                f"from state {_STATES[self.status]} with event {event.name}"
             )
         self.status = state
         self.status_cdr = self.status_cdr[:-1] + state.to_bytes(1, "little")

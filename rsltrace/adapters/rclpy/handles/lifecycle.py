@@ -16,7 +16,7 @@ from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
 from rsltrace.adapters.rclpy.handles.services import ServiceHandle
 from rsltrace.guard.callers import is_user_file
 from rsltrace.simulation.middleware.entity import callback_name
-from rsltrace.simulation.middleware.events.failure import exception_text
+from rsltrace.simulation.middleware.events.failure import as_printed, exception_text
 from rsltrace.simulation.middleware.interface import imported_file
 from rsltrace.trace.model.finding import SuppressedException
 from rsltrace.trace.model.texts import shortened
@@ -98,7 +98,8 @@ class NotingCallback:
 
     def _note(self, error: Exception) -> None:
         runtime, name = self._node.runtime, callback_name(self._callback)
-        text = shortened(f"{type(error).__qualname__}: {exception_text(error)}", _ERROR_MAX)
+        text = as_printed(type(error).__qualname__, exception_text(error))
+        text = shortened(text, _ERROR_MAX)
         node, place = self._node.fully_qualified_name, _user_line(error)
         found = SuppressedException(runtime.loop.events, node, name, text, place)
         outcome = runtime.domain.outcome

@@ -25,7 +25,7 @@ class TimerHandle(EntityHandle, Timer, TimerFields):
 
     def __init__(self, real: Any, runtime: Runtime, period_ns: int, autostart: bool) -> None:
         if period_ns < 0:
-            raise real.RCLError("timer period must be non-negative")
+            raise real.RCLError("failed to create timer: timer period must be non-negative")
         self.runtime = runtime
         self._real = real
         self._callback: Any = None
@@ -106,7 +106,7 @@ class TimerHandle(EntityHandle, Timer, TimerFields):
     def call_timer(self) -> None:
         """Account for a call by user code."""
         if self.state.canceled:
-            raise self._real.RCLError("timer is canceled")
+            raise self._real.RCLError("failed to call timer: timer is canceled")
         self.state.call(self.dispatcher.loop.now_ns)
         if self.active:
             self.dispatcher.loop.timers.moved(self.state)
@@ -242,7 +242,7 @@ class RosTimerHandle(TimerHandle):
             super().call_timer()
             return
         if self.state.canceled:
-            raise self._real.RCLError("timer is canceled")
+            raise self._real.RCLError("failed to call timer: timer is canceled")
         self.state.call(self._clock.now_ns())
 
     def reset(self) -> None:

@@ -56,7 +56,7 @@ class RaisedException:
 
     def as_error(self, hint: str = "") -> NodeError:
         return NodeError(
-            f"{self.where} raised {self.kind}: {self.said}{hint}",
+            f"{self.where} raised {as_printed(self.kind, self.said)}{hint}",
             node=self.node,
             entity=self.label,
             stamp_ns=self.stamp_ns,
@@ -109,6 +109,11 @@ class RunEndingExceptionHandler:
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
         raised = record_exception(self._dispatcher, error, handle)
         end_run(self._dispatcher, raised, raised.as_error())
+
+
+def as_printed(kind: str, said: str) -> str:
+    """Return type and text of an exception as Python prints them: ``KeyError: 'x'``."""
+    return f"{kind}: {said}" if said else kind
 
 
 def exception_text(error: BaseException) -> str:
