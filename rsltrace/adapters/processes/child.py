@@ -301,9 +301,8 @@ def _of_one_size(argv: Sequence[str], environment: dict[str, str]) -> dict[str, 
     after them moves with their size."""
     texts = [argv[0], *argv, *map("=".join, environment.items())]  # the kernel adds the program
     size = sum(len(os.fsencode(text)) + 1 for text in texts)
-    size += (
-        -(-(len(argv) + len(environment)) // 2) * 16
-    )  # pointers, in what the stack is aligned to
+    pointers = (len(argv) + len(environment)) * 8
+    size += pointers + pointers % 16  # as the stack is aligned
     name, value = environment.popitem()
     return {**environment, name: value + " " * (-size % _START_OF_STACK)}
 
