@@ -141,6 +141,8 @@ _LOST_LINK = 120  # of native/link.cpp
 _START_OF_STACK = 1 << 16
 """What command line and environment take there, or a multiple of it; one variable may have twice
 so many bytes."""
+_MOVED = 1 << 12
+"""Allocation noise moves the stack by less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +209,7 @@ class ProcessHandle:
             with nullcontext() if fixed is None else _addresses(fixed):
                 self._process = subprocess.Popen(
                     list(argv),
-                    env=_of_one_size(argv, {**environment, "RSLTRACE_LINK": link}),
+                    env=_of_one_size(argv, {**environment, "RSLTRACE_LINK": link}, noise % _MOVED),
                     cwd=folder,
                     stdin=subprocess.DEVNULL,
                     pass_fds=files,
@@ -296,15 +298,15 @@ class ProcessHandle:
         self._told.close()
 
 
-def _of_one_size(argv: Sequence[str], environment: dict[str, str]) -> dict[str, str]:
+def _of_one_size(argv: Sequence[str], environment: dict[str, str], moved: int) -> dict[str, str]:
     """Lengthen the last variable: command line and environment begin the stack, and all that comes
-    after them moves with their size."""
+    after them moves with their size; and by so many bytes more."""
     texts = [argv[0], *argv, *map("=".join, environment.items())]  # the kernel adds the program
     size = sum(len(os.fsencode(text)) + 1 for text in texts)
     pointers = (len(argv) + len(environment)) * 8
     size += pointers + pointers % 16  # as the stack is aligned
     name, value = environment.popitem()
-    return {**environment, name: value + " " * (-size % _START_OF_STACK)}
+    return {**environment, name: value + " " * (-size % _START_OF_STACK + moved)}
 
 
 @contextmanager
