@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.bags.comparison import diff_bags
 from rsltrace.diff.bags.sequences import Gap, gaps_by_order, gaps_by_stamp
+from rsltrace.diff.bags.source import RecordingSource, SourceTopic
 from rsltrace.diff.facts.bags import BagVerdict
 from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.file_kind import is_recording, is_trace
@@ -571,3 +572,10 @@ def test_a_damaged_length_at_the_head_is_no_traceback(tmp_path: Path) -> None:
     assert not is_trace(path)
     with pytest.raises(BagError):
         diff_bags(path, path)
+
+
+def test_a_definition_without_fields_is_one() -> None:
+    """As that of a request of ``std_srvs/srv/Trigger``."""
+    topic = SourceTopic("/rsltrace/request/ask", "std_srvs/srv/Trigger_Request", "")
+    recording = RecordingSource("a.mcap", "mcap", (topic,), lambda wanted: [], lambda: None)
+    assert type(recording.decode(0, b"\0\1\0\0\0")).__name__.endswith("Trigger_Request")

@@ -272,3 +272,13 @@ def test_delays_that_differ_in_the_seventh_digit(tmp_path: Path) -> None:
     assert "delay 100 ms in a, delay 100.0001 ms in b" in found.sentence
     (draw,) = found.divergences[0].messages[0].fields
     assert (draw.a, draw.b) == ("delay 100 ms", "delay 100.0001 ms")
+
+
+def test_a_message_that_comes_so_late_that_the_next_one_does(tmp_path: Path) -> None:
+    """The second waits for the first, and is not as late."""
+    a = recorded(tmp_path, "a.mcap")
+    slow = "        if message.data == 5:\n            import time; time.sleep(0.13)\n"
+    publish = "        self.out.publish(message)"
+    b = recorded(tmp_path, "b.mcap", (publish, slow + publish))
+    for found, late in zip(both_ways(a, b), "ba", strict=True):
+        assert f"(/heard 130 ms later in {late})" in found.sentence

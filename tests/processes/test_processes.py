@@ -311,6 +311,8 @@ def test_a_process_may_end_or_start_others(
 ) -> None:
     result = run(_job(tmp_path, counter, "'100'", action), tmp_path / "t.mcap")
     assert (result.error, result.exit_code) == (None, 0)
+    ended = [note for note in result.notes if note.endswith("counter ended at 0.500000000 s")]
+    assert len(ended) == (action == "leave"), result.notes
     assert len(_said(tmp_path / "t.mcap", "/count")["/count"]) == counted
     _no_process_of(counter)
 

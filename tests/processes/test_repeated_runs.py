@@ -5,6 +5,7 @@ Thirty-six runs in all with ``--many-cases``, as in ``make test-all``.
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 from collections.abc import Callable, Iterator
@@ -106,3 +107,22 @@ def test_a_node_with_an_address_in_its_name_has_one_name(
     with Trace.open(path) as trace:
         nodes = [one.name for one in trace.entities.values() if one.kind is EntityKind.NODE]
     assert len({name for name in nodes if name.startswith("/listener_")}) == 2
+
+
+def test_where_the_stack_lies_does_not_depend_on_the_size_of_the_surroundings(
+    compiled: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """``counter`` publishes where a variable of its ``main`` lies."""
+    found = set()
+    for i, more in enumerate(("", "a", "b" * 1000, "c" * 15_000)):
+        variables = {f"MORE_{k}": more for k in range(i)}
+        entry = {"program": str(compiled("counter.c")), "environment": variables}
+        entry["arguments"] = ["100", "address", *["d" * i] * i]
+        (tmp_path / "job.yaml").write_text(
+            json.dumps({"nodes": [entry], "stop": {"duration": "1s"}})
+        )
+        path = tmp_path / f"{i}.mcap"
+        assert run(load_job(tmp_path / "job.yaml"), path).error is None
+        with Trace.open(path) as trace:
+            found |= {trace.decode("/count", data).data for _, _, data in trace.messages("/count")}  # type: ignore[attr-defined]
+    assert len(found) == 1

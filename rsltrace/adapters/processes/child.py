@@ -138,6 +138,11 @@ _TURN = b"\0"
 _LOOK_S = 0.2
 _GRACE_S = 2.0
 _LOST_LINK = 120  # of native/link.cpp
+_START_OF_STACK = 1 << 16
+"""What command line and environment take there, or a multiple of it; one variable may have twice
+so many bytes."""
+_MOVED = 1 << 12
+"""Allocation noise moves the stack by less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,13 +204,12 @@ class ProcessHandle:
             self._has_spoken = partial(core.turn_over, shared)
         self._poll, self._rung = epoll.poll, (bell, select.EPOLLIN)
         files = (turns, bell, self.said.fd, self._told.fd)
-        # Of one length: the environment lies on the stack, and what comes after it moves.
-        link = ":".join(f"{number:010d}" for number in (os.getpid(), *files, noise))
+        link = ":".join(str(number) for number in (os.getpid(), *files, noise))
         try:
             with nullcontext() if fixed is None else _addresses(fixed):
                 self._process = subprocess.Popen(
                     list(argv),
-                    env={**environment, "RSLTRACE_LINK": link},
+                    env=_of_one_size(argv, {**environment, "RSLTRACE_LINK": link}, noise % _MOVED),
                     cwd=folder,
                     stdin=subprocess.DEVNULL,
                     pass_fds=files,
@@ -292,6 +296,17 @@ class ProcessHandle:
         self._link.close()
         self.said.close()
         self._told.close()
+
+
+def _of_one_size(argv: Sequence[str], environment: dict[str, str], moved: int) -> dict[str, str]:
+    """Lengthen the last variable: command line and environment begin the stack, and all that comes
+    after them moves with their size; and by so many bytes more."""
+    texts = [argv[0], *argv, *map("=".join, environment.items())]  # the kernel adds the program
+    size = sum(len(os.fsencode(text)) + 1 for text in texts)
+    pointers = (len(argv) + len(environment)) * 8
+    size += pointers + pointers % 16  # as the stack is aligned
+    name, value = environment.popitem()
+    return {**environment, name: value + " " * (-size % _START_OF_STACK + moved)}
 
 
 @contextmanager

@@ -359,9 +359,12 @@ class Process:
         self.ended = ProcessEnd(ended.status, broken_link or ended.broken_link)
         self.vanish()
         self.adapter.has_ended(self)
-        if not self.ended.failed or self._is_stopping:
+        if self._is_stopping:
             return
         at = format_seconds(self.dispatcher.loop.now_ns)  # of ROS: the text is hashed
+        if not self.ended.failed:
+            self.adapter.domain.outcome.notes.append(f"process {self.name} ended at {at} s")
+            return
         last = "its start" if self._last is None else self._last.describe()
         happened = f"process {self.name} {self.ended.said} at {at} s"
         text = f"{happened}; the last that it ran was {last}"

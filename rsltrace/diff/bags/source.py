@@ -25,11 +25,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SourceTopic:
-    """A topic and how to decode its messages: ``schema`` is its ros2msg text, or empty."""
+    """A topic and how to decode its messages: ``schema`` is its ros2msg text, if there is
+    one; that of a message without fields is empty."""
 
     name: str
     type: str
-    schema: str = ""
+    schema: str | None = None
 
 
 @dataclass(slots=True)
@@ -78,7 +79,7 @@ def open_source(path: str | os.PathLike[str]) -> RecordingSource:
             SourceTopic(
                 topic.name,
                 topic.type_name,
-                (topic.schema_text or "") if topic.schema_encoding == SCHEMA_ENCODING else "",
+                topic.schema_text if topic.schema_encoding == SCHEMA_ENCODING else None,
             )
             for topic in bag.topics
         ),
@@ -143,7 +144,7 @@ def _payload_notes(trace: Trace) -> tuple[str, ...]:
 
 
 def _decoder(topic: SourceTopic) -> Callable[[bytes], object]:
-    if topic.schema:
+    if topic.schema is not None:
         from rsltrace.trace.decode import Decoder
         from rsltrace.trace.index import ChannelInfo
 

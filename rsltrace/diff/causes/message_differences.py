@@ -333,15 +333,15 @@ class _OutputChanges:
         return rows[0], rows[1]
 
     def _later(self, row: OutputRow, *, only_b: bool) -> SendDelay | None:
-        """Say whether the other run sends the same later, and from there on as this one."""
+        """Say whether the other run sends the same later, and then what this one sends."""
         has, has_not = self._rows[::-1] if only_b else self._rows
         mine, theirs = (list(islice(_sent(rows, row), 2)) for rows in (has, has_not))
         if not mine or not theirs:
             return None
         late_ns = theirs[0][0] - mine[0][0]
-        moved = [(stamp + late_ns, content) for stamp, content in mine]
-        repeats = len({content for _, content in mine}) < len(mine)
-        if late_ns <= 0 or (mine[1:] != theirs[1:] and (repeats or moved != theirs)):
+        contents, others = ([content for _, content in sent] for sent in (mine, theirs))
+        repeats = len(set(contents)) < len(contents)
+        if late_ns <= 0 or contents != others or (repeats and mine[1:] != theirs[1:]):
             return None  # another one, of a sender that often sends the same
         return SendDelay(late_ns, "a" if only_b else "b")
 

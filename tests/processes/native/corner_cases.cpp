@@ -282,8 +282,22 @@ void entropy() {
   if (found != nullptr) reinterpret_cast<void (*)(std::uint64_t *)>(found)(words);
   std::printf("%016llx ", static_cast<unsigned long long>(words[0]));
   if (syscall(SYS_getrandom, &words[0], 8, 0) != 8) std::abort();
-  std::printf("%08x %016llx %016llx\n", device(), static_cast<unsigned long long>(again),
+  std::string uuid;
+  std::ifstream("/proc/sys/kernel/random/uuid") >> uuid;
+  std::printf("%s %08x %016llx %016llx\n", uuid.c_str(), device(), static_cast<unsigned long long>(again),
               static_cast<unsigned long long>(words[0]));
+}
+
+void real_timers() {
+  alarm(0);
+  alarm(1000);
+  alarm(1000);
+  itimerval once{};
+  once.it_value.tv_sec = 1000;
+  setitimer(ITIMER_REAL, &once, nullptr);
+  timer_t timer;
+  timer_create(CLOCK_MONOTONIC, nullptr, &timer);
+  std::puts("made");
 }
 
 void processors() {
@@ -477,6 +491,7 @@ int main(int, char **argv) {
       {"itself", itself}, {"cycle", cycle}, {"everybody", everybody}, {"handler_posts", handler_posts},
       {"signal_from_outside", signal_from_outside}, {"thread_signals", thread_signals}, {"cancel", cancel},
       {"destructors", destructors}, {"main_leaves", main_leaves}, {"children", children}, {"entropy", entropy},
+      {"real_timers", real_timers},
       {"processors", processors}, {"clocks", clocks}, {"busy", busy}, {"outside_pipe", outside_pipe},
       {"outside_unseen", outside_unseen}, {"inner_files", inner_files}, {"full", full}, {"fortified", fortified},
       {"processor_time", processor_time}, {"crash", crash},

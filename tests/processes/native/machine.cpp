@@ -58,6 +58,9 @@ void names() {
               flags.c_str() + sizeof folder, mkstemp(wrong));
   for (const auto &one : {file, ending, flags}) unlink(one.c_str());
   rmdir(folder);
+  char name[L_tmpnam], *other = tempnam("/none", "ab"), made[] = "/tmp/XXXXXX";
+  std::printf("%s %s %s %s\n", tmpnam(name), other, mktemp(made), *mktemp(wrong) == 0 ? "no" : wrong);
+  std::free(other);
 }
 
 std::int64_t now_ms() {

@@ -170,7 +170,14 @@ def test_where_memory_lies_does_not_depend_on_real_time(programs: Programs) -> N
 def test_chance_comes_from_the_seed_and_every_source_goes_on(corner: Corner) -> None:
     ran = corner("entropy")
     assert ran.out == corner("entropy").out != corner("entropy", native=True).out
-    assert len(set(ran.out.split())) == 8
+    assert len(set(ran.out.split())) == 9
+    assert re.search(r" \w{8}-\w{4}-4\w{3}-[89ab]\w{3}-\w{12} ", ran.out)
+
+
+def test_timers_that_count_real_time_are_named_once(corner: Corner) -> None:
+    ran = corner("real_timers")
+    said = [line for line in ran.err.splitlines() if "counts real time" in line]
+    assert (ran.out, len(said)) == ("made\n", 3), ran.err
 
 
 @pytest.mark.parametrize("name", ["outside_pipe", "outside_unseen"])

@@ -10,6 +10,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <random>
+#include <string_view>
 #include <utility>
 #include <vector>
 
@@ -42,29 +43,51 @@ void fill(void *out, std::size_t length) {
   }
 }
 
+std::string hexadecimal(unsigned char byte) {
+  char digits[3];
+  std::snprintf(digits, sizeof digits, "%02x", byte);
+  return digits;
+}
+
 // The first bytes, for the trace.
 std::string shown(const void *drawn, std::size_t length) {
   constexpr std::size_t SHOWN_BYTES = 8;
   std::string text;
-  for (std::size_t i = 0; i < length && i < SHOWN_BYTES; ++i) {
-    char digits[3];
-    std::snprintf(digits, sizeof digits, "%02x", static_cast<const unsigned char *>(drawn)[i]);
-    text += digits;
-  }
+  for (std::size_t i = 0; i < length && i < SHOWN_BYTES; ++i)
+    text += hexadecimal(static_cast<const unsigned char *>(drawn)[i]);
   return text + (length > SHOWN_BYTES ? "…" : "");
 }
 
-bool is_device(const char *path) {
-  return path != nullptr && (std::strcmp(path, "/dev/urandom") == 0 || std::strcmp(path, "/dev/random") == 0);
+// A UUID of version 4, of RFC 4122.
+void fill_uuid(unsigned char *out) {
+  fill(out, 16);
+  out[6] = static_cast<unsigned char>((out[6] & 0x0f) | 0x40);
+  out[8] = static_cast<unsigned char>((out[8] & 0x3f) | 0x80);
 }
 
-// A file with what the device would give; -1 if this process is not simulated or it cannot be made.
+// What the kernel would give to who reads this file, empty for files without chance.
+std::string bytes_of(std::string_view path) {
+  std::string bytes;
+  if (path == "/dev/urandom" || path == "/dev/random") {
+    bytes.resize(DEVICE_BYTES);
+    fill(bytes.data(), bytes.size());
+  } else if (path == "/proc/sys/kernel/random/uuid") {
+    unsigned char uuid[16];
+    fill_uuid(uuid);
+    for (std::size_t i = 0; i < sizeof uuid; ++i)
+      bytes += (i == 4 || i == 6 || i == 8 || i == 10 ? "-" : "") + hexadecimal(uuid[i]);
+    bytes += '\n';
+  }
+  return bytes;
+}
+
+// A file with that; -1 if this process is not simulated or it cannot be made.
 int open_device(const char *path, const void *caller) {
-  if (!is_device(path) || me() == nullptr) return -1;
+  if (path == nullptr || me() == nullptr) return -1;
+  const std::string bytes = bytes_of(path);
+  if (bytes.empty()) return -1;
   const int file = memfd_create("rsltrace-random", MFD_CLOEXEC);
   if (file < 0) return -1;
-  std::string bytes(DEVICE_BYTES, '\0');
-  fill(bytes.data(), bytes.size());
   if (REAL(write)(file, bytes.data(), bytes.size()) != static_cast<ssize_t>(bytes.size()) ||
       lseek(file, 0, SEEK_SET) != 0) {
     close(file);
@@ -169,9 +192,7 @@ RSLTRACE_EXPORT void uuid_generate_random(unsigned char *out) {
   using Function = void(unsigned char *);
   static auto *original = reinterpret_cast<Function *>(real("uuid_generate_random"));
   if (me() == nullptr && original != nullptr) return original(out);
-  fill(out, 16);
-  out[6] = static_cast<unsigned char>((out[6] & 0x0f) | 0x40);  // version 4, of RFC 4122
-  out[8] = static_cast<unsigned char>((out[8] & 0x3f) | 0x80);
+  fill_uuid(out);
   RSLTRACE_NOTE(Source::RANDOM, "uuid_generate_random()", shown(out, 16));
 }
 

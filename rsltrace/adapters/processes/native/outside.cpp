@@ -7,7 +7,9 @@
 #include <signal.h>
 #include <stdio.h>
 #include <sys/syscall.h>
+#include <sys/time.h>
 #include <sys/wait.h>
+#include <time.h>
 #include <unistd.h>
 
 #include <cstring>
@@ -123,9 +125,22 @@ void start_service() {
   pthread_sigmask(SIG_SETMASK, &before, nullptr);
 }
 
-void tell_outside(Thread &thread, const std::string &what) {
+namespace {
+
+bool is_new(const std::string &what) {
   static auto *told = new std::set<std::string>;
-  if (!told->insert(what).second) return;
+  return told->insert(what).second;
+}
+
+void tell_real_timer(const char *call) {
+  if (me() != nullptr && is_new(call))
+    report(std::string(call) + " counts real time: when its signal comes is not determined");
+}
+
+}  // namespace
+
+void tell_outside(Thread &thread, const std::string &what) {
+  if (!is_new(what)) return;
   report("thread " + std::to_string(thread.number) + " blocks outside of the simulation, in " + what +
          ": what comes from there, and when, is not determined");
 }
@@ -194,4 +209,19 @@ RSLTRACE_EXPORT int pclose(FILE *stream) {
   if (thread == nullptr) return REAL(pclose)(stream);
   Outside outside(*thread, "pclose");
   return REAL(pclose)(stream);
+}
+
+RSLTRACE_EXPORT unsigned alarm(unsigned seconds) noexcept {
+  if (seconds > 0) tell_real_timer("alarm()");
+  return REAL(alarm)(seconds);
+}
+
+RSLTRACE_EXPORT int setitimer(__itimer_which_t which, const itimerval *set, itimerval *old) noexcept {
+  tell_real_timer("setitimer()");
+  return REAL(setitimer)(which, set, old);
+}
+
+RSLTRACE_EXPORT int timer_create(clockid_t clock, sigevent *event, timer_t *timer) noexcept {
+  tell_real_timer("timer_create()");
+  return REAL(timer_create)(clock, event, timer);
 }

@@ -1,6 +1,7 @@
 // Names of temporary files: libc draws them from the machine's chance.
 #include <errno.h>
 #include <fcntl.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <sys/stat.h>
 #include <unistd.h>
@@ -48,6 +49,18 @@ int make_file(char *path, int suffix, int flags) {
   });
 }
 
+// A name that no file has, in the place of `path`.
+int make_name(char *path) {
+  return make(path, 0, [](const char *name) { return access(name, F_OK) == 0 ? (errno = EEXIST, -1) : 0; });
+}
+
+// The name that libc has made, with other letters at its end.
+char *other_name(char *path) {
+  if (path == nullptr || me() == nullptr) return path;
+  std::memcpy(path + std::strlen(path) - DRAWN, "XXXXXX", DRAWN);
+  return make_name(path) == 0 ? path : nullptr;
+}
+
 }  // namespace
 
 #define RSLTRACE_TEMPORARY(name, suffix, flags, parameters, arguments)   \
@@ -68,4 +81,17 @@ RSLTRACE_TEMPORARY(mkostemps64, suffix, flags, (char *path, int suffix, int flag
 RSLTRACE_EXPORT char *mkdtemp(char *path) noexcept {
   if (me() == nullptr) return REAL(mkdtemp)(path);
   return make(path, 0, [](const char *name) { return mkdir(name, S_IRWXU); }) == 0 ? path : nullptr;
+}
+
+RSLTRACE_EXPORT char *mktemp(char *path) noexcept {
+  if (me() == nullptr) return REAL(mktemp)(path);
+  if (make_name(path) != 0) *path = 0;
+  return path;
+}
+
+RSLTRACE_EXPORT char *tmpnam(char *path) noexcept { return other_name(REAL(tmpnam)(path)); }
+RSLTRACE_EXPORT char *tmpnam_r(char *path) noexcept { return other_name(REAL(tmpnam_r)(path)); }
+
+RSLTRACE_EXPORT char *tempnam(const char *folder, const char *prefix) noexcept {
+  return other_name(REAL(tempnam)(folder, prefix));
 }
