@@ -99,6 +99,15 @@ def as_sentence(text: str) -> str:
     return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
+def exception_of(traceback: str) -> str:
+    """Return the type and message of the exception that a traceback ends with, in one line."""
+    lines = traceback.splitlines()
+    frames = [at for at, line in enumerate(lines) if line.startswith("  File ")]
+    after = lines[frames[-1] + 1 :] if frames else lines
+    first = next((at for at, line in enumerate(after) if line and not line.startswith(" ")), 0)
+    return " ".join(" ".join(after[first:]).split())
+
+
 def path_word(path: str) -> str:
     """Return a path as a word of a command, never an option."""
     return shlex.quote(f"./{path}" if path.startswith("-") else path)
