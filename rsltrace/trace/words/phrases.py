@@ -102,7 +102,7 @@ def as_sentence(text: str) -> str:
 def exception_of(traceback: str) -> str:
     """Return the type and message of the exception that a traceback ends with, in one line."""
     lines = traceback.splitlines()
-    frames = [at for at, line in enumerate(lines) if line.startswith("  File ")]
+    frames = [at for at, line in enumerate(lines) if line.startswith(("Traceback (", "  File "))]
     after = lines[frames[-1] + 1 :] if frames else lines
     first = next((at for at, line in enumerate(after) if line and not line.startswith(" ")), 0)
     return " ".join(" ".join(after[first:]).split())
