@@ -16,7 +16,7 @@ from rsltrace.cli.options import set_option
 from rsltrace.cli.output.text_file import check_picture, save_picture
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import parse_time
-from rsltrace.terminal import say, tell
+from rsltrace.terminal import say, tell, tell_notes
 from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
@@ -211,5 +211,4 @@ def _print(found: TimingAnalysis, times: str, native: Sequence[str]) -> None:
     from rsltrace.cli.output.analysis_text import text
 
     say("\n".join(map(printable, text(found, times, native))))
-    for note in found.notes:
-        tell(printable(f"rsltrace: note: {note}"))
+    tell_notes(found.notes)

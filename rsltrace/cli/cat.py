@@ -16,7 +16,7 @@ import numpy.typing as npt
 from rsltrace.cli.output.event_json import EventJson
 from rsltrace.errors import TraceError, near_or_all
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.terminal import line_writer
+from rsltrace.terminal import line_writer, tell_notes
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, EventRecord, Output, OutputKind
 from rsltrace.trace.model.finding import Finding
@@ -26,6 +26,7 @@ from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.code import code_places, output_places, places_text
 from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.kinds import flag_names
+from rsltrace.trace.words.phrases import notes_on
 
 _VALUE_MAX = 200
 _COLUMN_MAX = 40
@@ -199,6 +200,7 @@ def cat(
     if payloads and not as_json:
         raise click.UsageError("--payloads needs --json")
     with Trace.open(trace) as opened:
+        tell_notes(notes_on(opened))
         choice = _choice(opened, topics, nodes, entities, kinds, first, last)
         condition = None if where is None else _condition(where, opened)
         events = _events(opened, choice, condition)

@@ -18,7 +18,7 @@ import click
 from rsltrace.cli.output.fit_text import as_json, checked_text, text
 from rsltrace.cli.output.text_file import check_picture, save_picture, write_text
 from rsltrace.errors import OutputError, RunError, TraceError
-from rsltrace.terminal import say, tell
+from rsltrace.terminal import say, tell, tell_notes
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
@@ -130,8 +130,7 @@ def fit(
             say(json.dumps(as_json(found, said, checked), indent=2))
             return
         say("\n".join(map(printable, text(found))))
-        for note in said:
-            tell(printable(f"rsltrace: note: {note}"))
+        tell_notes(said)
         for written in (output, plot, simulated):
             if written is not None:
                 tell(f"wrote {written}")
