@@ -7,9 +7,9 @@ a name must not set a window's title, hide a line or turn text around. Lines sta
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
-from rsltrace.trace.model.texts import printable_lines
+from rsltrace.trace.model.texts import printable, printable_lines
 
 
 def say(text: str = "", *, end: str = "\n") -> None:
@@ -24,6 +24,12 @@ def tell(text: str, *, end: str = "\n") -> None:
     if sys.stderr is not None:
         sys.stderr.write(printable_lines(f"{text}{end}"))
         sys.stderr.flush()
+
+
+def tell_notes(notes: Iterable[str]) -> None:
+    """Write what there is to know about an answer to stderr, each note in a line."""
+    for note in notes:
+        tell(printable(f"rsltrace: note: {note}"))
 
 
 def line_writer() -> Callable[[str], object]:

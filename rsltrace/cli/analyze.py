@@ -18,7 +18,7 @@ from rsltrace.cli.options import set_option
 from rsltrace.cli.output.text_file import check_picture, save_picture
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import parse_time
-from rsltrace.terminal import say, tell
+from rsltrace.terminal import say, tell, tell_notes
 from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.words.phrases import table
 
@@ -208,8 +208,7 @@ def _simulated(job: Job, stack: ExitStack) -> ObservedChains:
 
 def _print(found: TimingAnalysis, times: str, native: Sequence[str]) -> None:
     say("\n".join(map(printable, _as_text(found, times, native))))
-    for note in found.notes:
-        tell(printable(f"rsltrace: note: {note}"))
+    tell_notes(found.notes)
 
 
 # The report: chains with bounds and worst observed response times.

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError, near_or_all
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.terminal import line_writer
+from rsltrace.terminal import line_writer, tell_notes
 from rsltrace.trace.format import TOPIC_DETAILS
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import (
@@ -36,6 +36,7 @@ from rsltrace.trace.words.code import code_place, code_places, output_places, pl
 from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.kinds import flag_names
 from rsltrace.trace.words.logs import log_record
+from rsltrace.trace.words.phrases import notes_on
 
 if TYPE_CHECKING:
     from rsltrace.conditions.trace_events import TraceCondition
@@ -296,6 +297,7 @@ def cat(
     if payloads and not as_json:
         raise click.UsageError("--payloads needs --json")
     with Trace.open(trace) as opened:
+        tell_notes(notes_on(opened))
         choice = _choice(opened, topics, nodes, entities, kinds, first, last)
         condition = None if where is None else _condition(where, opened)
         events = _events(opened, choice, condition)

@@ -14,9 +14,9 @@ from rsltrace.cli.job_source import JobArguments, RosArgsCommand, job_options
 from rsltrace.cli.output.exit_status import tell_error
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, RunError
-from rsltrace.terminal import say, tell
+from rsltrace.terminal import say, tell, tell_notes
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
-from rsltrace.trace.words.phrases import table
+from rsltrace.trace.words.phrases import notes_on, table
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
@@ -129,11 +129,9 @@ def _check_trace(path: Path, other: Path | None, form: str) -> int:
     from rsltrace.job import load_job
     from rsltrace.trace.reader import Trace
 
-    if other is not None:
-        job = load_job(other)
-    else:
-        with Trace.open(path) as trace:
-            job = job_of_checks(trace)
+    with Trace.open(path) as trace:
+        tell_notes(notes_on(trace))
+        job = job_of_checks(trace) if other is None else load_job(other)
     if not (job.checks or job.metrics):
         named = other if other is not None else f"the job of {path}"
         none = f"{named} has neither checks (checks:) nor metrics"

@@ -30,7 +30,7 @@ from rsltrace.native.fit.comparison import (
 )
 from rsltrace.native.fit.fitted_job import Fit, time_text
 from rsltrace.native.fit.models import DurationModel, as_job_has_it
-from rsltrace.terminal import say, tell
+from rsltrace.terminal import say, tell, tell_notes
 from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import table
@@ -143,8 +143,7 @@ def fit(
             say(json.dumps(_as_json(found, said, checked), indent=2))
             return
         say("\n".join(map(printable, _as_text(found))))
-        for note in said:
-            tell(printable(f"rsltrace: note: {note}"))
+        tell_notes(said)
         for written in (output, plot, simulated):
             if written is not None:
                 tell(f"wrote {written}")

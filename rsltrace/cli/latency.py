@@ -17,11 +17,11 @@ import click
 from rsltrace.checks.latency.instances import HopMessages, HopTimes, LatencyFigures, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, Latencies, measure_latencies
 from rsltrace.errors import TraceError
-from rsltrace.terminal import say, tell
+from rsltrace.terminal import say, tell, tell_notes
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import RUN_NAME
-from rsltrace.trace.words.phrases import table
+from rsltrace.trace.words.phrases import notes_on, table
 
 
 @click.command()
@@ -87,6 +87,8 @@ def latency(
         raise click.UsageError("--format csv needs a single trace")
     with ExitStack() as stack:
         opened = [stack.enter_context(Trace.open(one)) for one in (trace, other) if one is not None]
+        for one in opened:
+            tell_notes(notes_on(one))
         found = [
             measure_latencies(one, start=start, end=end, topics=topics, via=via) for one in opened
         ]
@@ -122,8 +124,7 @@ def _print(trace: Path, other: Path | None, found: Sequence[Latencies]) -> None:
         raise TraceError(f"{trace} has no chain: no message was caused by another one{notes}")
     lines = _as_text(found[0]) if other is None else _compared_text(*found)
     say("\n".join(map(printable, lines)))
-    for note in dict.fromkeys(note for one in found for note in one.notes):
-        tell(printable(f"rsltrace: note: {note}"))
+    tell_notes(dict.fromkeys(note for one in found for note in one.notes))
     worst = found[0].chains[0].worst("latency") if other is None else None
     if worst is not None:
         tell(f"next: rsltrace view {shlex.quote(str(trace))} --at {worst.output_event}")

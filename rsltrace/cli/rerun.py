@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from rsltrace.terminal import say, tell
+from rsltrace.terminal import say, tell_notes
 
 
 @click.command()
@@ -58,7 +58,7 @@ def rerun(
     if output is not None:
         with working(f"writing {output}"):
             done = export(traces, output, force=force, by_event=by_event)
-        _tell_what_is_left_out(done.left_out)
+        tell_notes(done.notes)
         if not quiet:
             say(
                 f"wrote {output}: {done.events} events, {done.bytes / 1e6:.1f} MB "
@@ -70,10 +70,5 @@ def rerun(
         with show.temporary_recording() as target:
             with working("making the recording"):
                 done = export(traces, target, by_event=by_event)
-            _tell_what_is_left_out(done.left_out)
+            tell_notes(done.notes)
             show.open_viewer(target, how)
-
-
-def _tell_what_is_left_out(lines: tuple[str, ...]) -> None:
-    for line in lines:
-        tell(f"rsltrace: note: {line}")

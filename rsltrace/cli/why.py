@@ -9,9 +9,9 @@ import click
 
 from rsltrace.cli.cat import RunTimeParam
 from rsltrace.job.values.times import TimeInRun
-from rsltrace.terminal import say, tell
+from rsltrace.terminal import say, tell, tell_notes
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.phrases import path_word
+from rsltrace.trace.words.phrases import notes_on, path_word
 
 
 @click.command()
@@ -43,6 +43,7 @@ def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) 
     from rsltrace.why.answer import why as find_reason
 
     with Trace.open(trace) as opened:
+        tell_notes(notes_on(opened))
         at_ns = None if at is None else at.stamp_ns(opened.start_ns, opened.end_ns)
         reason = find_reason(opened, node, what, at_ns)
         if as_json:

@@ -242,7 +242,8 @@ class _ConditionParser:
         if value.startswith("/"):
             every = (*names.nodes, *names.topics, *names.entities)
             wrong = names.unknown(value, every, "node, topic or entity")
-            wrong = wrong or f"say node {value}, topic {value} or entity {value}"
+            of_what = f"say node {value}, topic {value} or entity {value}"
+            wrong = wrong or f"{of_what}; of messages {value}: EXPRESSION"
         else:
             hint = did_you_mean(value.lower(), [*_READERS, *_WORDS], _KNOWN)
             wrong = f"{value!r} is no condition; {hint}"
@@ -304,7 +305,8 @@ class _ConditionParser:
         if self._at < len(text):
             if (found := _IF.match(text, self._at)) is None:
                 rest = len(text.rstrip()) - self._at
-                raise self._wrong("only 'if EXPRESSION' can follow here", rest)
+                only = "only 'if EXPRESSION' can follow here, after a topic also ': EXPRESSION'"
+                raise self._wrong(only, rest)
             expression = parse_expression(
                 text[found.end() :], self._names, whole=text, begin=found.end(), has_own=True
             )

@@ -21,6 +21,7 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.entities import is_named
 from rsltrace.trace.words.logs import log_record
+from rsltrace.trace.words.phrases import exception_of
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 
@@ -100,8 +101,8 @@ class TraceEvent:
             record = log_record(self._trace, output)
             if record is not None:
                 return SentOutput(kind, name, output.hash, record.text, record.level)
-        lines = (self._trace.detail(output) or "").strip().splitlines()
-        return SentOutput(kind, name, output.hash, lines[-1] if lines else "")
+        text = exception_of(self._trace.detail(output) or "")
+        return SentOutput(kind, name, output.hash, text)
 
     def _name(self, output: Output) -> str:
         return self._trace.entity(output.entity).name

@@ -19,6 +19,7 @@ from rsltrace.trace.format import EVENT_REST
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.words.logs import parse_log
+from rsltrace.trace.words.phrases import exception_of
 
 if TYPE_CHECKING:
     from rsltrace.debug.event_history import EventLedger, Payload
@@ -201,8 +202,7 @@ class CurrentEventView:
         entity = self._ledger.entities.get(entity_id)
         name = entity.name if entity is not None else ""
         if isinstance(kept, str):
-            lines = kept.strip().splitlines() or [""]
-            return SentOutput(kind, name, content_hash, lines[-1])
+            return SentOutput(kind, name, content_hash, exception_of(kept))
         if kept is None:
             return SentOutput(kind, name, content_hash)
         if kind == OutputKind.LOG:

@@ -288,7 +288,8 @@ def not_a_trace_error(source: ByteSource, index: TraceIndex) -> TraceFormatError
     """Return the error for an MCAP file of another writer."""
     profile, library = index.header
     writer = f"written by {library!r}" if library else "of an unknown writer"
-    hint = "; to use it as input, name it under bags: in a job" if profile == "ros2" else ""
+    use = "; `rsltrace view` and `rsltrace diff` read it, and bags: in a job plays it"
+    hint = use if profile == "ros2" else ""
     return TraceFormatError(
         f"{source.name} is a plain MCAP recording ({writer}), not a trace of rsltrace{hint}"
     )

@@ -16,6 +16,7 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, OutputKind
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.words.code import entity_places
+from rsltrace.trace.words.phrases import exception_of
 from rsltrace.why.history import Message, Occupation, RunHistory
 
 SENDERS = {
@@ -139,7 +140,7 @@ class Question:
         return [one for one in value if isinstance(one, dict)] if isinstance(value, list) else []
 
     def raised(self, event: int) -> tuple[str, str] | None:
-        """Return the last line of the exception that an event raised, and its place in user code;
+        """Return the exception that an event raised, and its place in user code;
         None if it raised none."""
         trace = self.history.trace
         if not int(self.history.events["flags"][event]) & EventFlag.RAISED:
@@ -153,16 +154,7 @@ class Question:
             for file in sorted(files, key=len)
             if f"/{path}".endswith(f"/{file}")
         ]
-        return printable(_said(text)), places[-1] if places else ""
-
-
-def _said(text: str) -> str:
-    """Return the type and message of the exception that a traceback ends with, in one line."""
-    lines = text.splitlines()
-    frames = [at for at, line in enumerate(lines) if line.startswith("  File ")]
-    after = lines[frames[-1] + 1 :] if frames else lines
-    first = next((at for at, line in enumerate(after) if line and not line.startswith(" ")), 0)
-    return " ".join(" ".join(after[first:]).split())
+        return printable(exception_of(text)), places[-1] if places else ""
 
 
 def filter_of(entity: Entity) -> tuple[str, str, int] | None:

@@ -217,6 +217,16 @@ def test_cat_of_an_interrupted_run_is_that_of_the_whole(
     assert [line.split() for line in cut] == [line.split() for line in whole]
 
 
+@pytest.mark.parametrize("command", ["cat", "check", "latency", "why"])
+def test_what_is_read_from_a_truncated_trace_says_so(
+    run: tuple[Path, Feeder], interrupted: Path, command: str
+) -> None:
+    more = ["/source"] if command == "why" else []
+    note = f"rsltrace: note: {interrupted} is truncated (its run was killed, or still runs): it has"
+    assert note in call(command, interrupted, *more).stderr
+    assert "is truncated" not in call(command, run[0], *more).stderr
+
+
 def test_cat_as_json(run: tuple[Path, Feeder]) -> None:
     golden("cat.jsonl", output("cat", run[0], "--json"))
 
@@ -389,7 +399,7 @@ def test_nothing_of_a_trace_steers_the_terminal(tmp_path: Path) -> None:
         text = output(*arguments, path)
         assert not set(text) & set("\x1b\x07\u202e")
     (line,) = lines(path)
-    assert r"exception second line" in line
+    assert r"exception \x1b[31mred\x1b[0m second line\u202e\x07" in line
     assert r"\x1b[31mred\x1b[0m\nsecond line\u202e\x07" in line
     assert "#3000000000" in line
     assert "#4000000000" in line

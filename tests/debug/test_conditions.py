@@ -280,6 +280,7 @@ def test_if_takes_fields_of_what_was_received() -> None:
         ("exeption", "'exeption' is no condition; did you mean 'exception'?", "exeption"),
         ("/nothing", "no node, topic or entity is called '/nothing'", "/nothing"),
         ("812 /odom", "only 'if EXPRESSION' can follow here", "/odom"),
+        ("/odom pose.x > 1", "after a topic also ': EXPRESSION'", "pose.x > 1"),
         ("node /ekf if", "an expression is missing here", ""),
         ("when ä.x > 1", "there is no node 'ä'", "ä"),
         ("when ekf.ä > efk.x", "there is no node 'efk'; did you mean 'ekf'?", "efk"),
@@ -296,6 +297,11 @@ def test_of_a_run_that_may_make_more_a_name_is_no_mistake() -> None:
     some = RunNames(nodes=("/ekf",))
     for text in ("node /later", "topic /later", "watch later.x", "/later: x > 1"):
         assert parse_condition(text, some).text == text
+
+
+def test_a_forgotten_colon_is_told_before_the_names_are_known() -> None:
+    with pytest.raises(ConditionError, match="of messages /later: EXPRESSION"):
+        parse_condition("/later x > 1", RunNames())
 
 
 def test_control_characters_do_not_reach_a_terminal_and_the_place_stays() -> None:

@@ -11,6 +11,7 @@ import rsltrace
 from rsltrace import DebugSession
 from rsltrace.errors import ConditionError, DebugError, EditError, OutputError, ReplayError
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.events import EventWords
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +33,37 @@ def session(shared: DebugSession) -> DebugSession:
 def trace(folder: Path) -> Iterator[Trace]:
     with Trace.open(folder / "run.mcap") as opened:
         yield opened
+
+
+def test_an_exception_of_several_lines_is_known_by_its_type(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "strict.py").write_text(
+        "from rclpy.node import Node\n"
+        "class Strict(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('strict')\n"
+        "        self.create_timer(0.1, self.tick)\n"
+        "    def tick(self):\n"
+        "        raise ValueError('2 errors:\\n  rate: too high')\n"
+    )
+    (tmp_path / "job.yaml").write_text(
+        "nodes: [{node: 'strict:Strict'}]\nsearch_path: [.]\nstop: {duration: 1s}\n"
+        "checks: [{never: exception ValueError}]\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    job = rsltrace.load_job("job.yaml")
+    with pytest.raises(rsltrace.errors.NodeError):
+        rsltrace.record(job, "run.mcap")
+    said = "raised ValueError: 2 errors: rate: too high"
+    with Trace.open("run.mcap") as trace:
+        (never,) = rsltrace.evaluate_checks(trace, job)
+        words = EventWords(trace).outputs(trace.outputs_of(1))
+        assert [one.text for one in never.violations] == [said]
+        assert said.replace("raised", "exception") in list(words)
+    with DebugSession("run.mcap", trust=True) as session:
+        session.break_at("exception ValueError")
+        assert session.go_on().position.index == 2
 
 
 def test_a_step_is_an_event_of_the_trace(session: DebugSession, trace: Trace) -> None:

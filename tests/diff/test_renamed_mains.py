@@ -77,3 +77,26 @@ def test_another_program_is_another_one(compared: Any) -> None:
     )
     assert found.verdict is Verdict.GRAPH
     assert "the graphs differ: /a in a is renamed to /b in b" in found.sentence
+
+
+def test_a_node_of_another_class_is_the_node_of_its_name(tmp_path: Path) -> None:
+    for module, value in (("talk", "self.count"), ("talk_v2", "self.count + (self.count > 5)")):
+        (tmp_path / f"{module}.py").write_text(
+            "from rclpy.node import Node\n"
+            "from std_msgs.msg import Int64\n"
+            "class Talk(Node):\n"
+            "    def __init__(self):\n"
+            "        super().__init__('talk')\n"
+            "        self.count = 0\n"
+            "        self.out = self.create_publisher(Int64, 'x', 10)\n"
+            "        self.create_timer(0.1, self.tick)\n"
+            "    def tick(self):\n"
+            "        self.count += 1\n"
+            f"        self.out.publish(Int64(data={value}))\n"
+        )
+        job = tmp_path / f"{module}.yaml"
+        job.write_text(f"nodes: [{{node: '{module}:Talk'}}]\nstop: {{duration: 1s}}\n")
+        record(load_job(job), tmp_path / f"{module}.mcap")
+    diff = diff_files(tmp_path / "talk.mcap", tmp_path / "talk_v2.mcap")
+    assert "talk:Talk → talk_v2:Talk" in diff.sentence
+    assert "first effect: /talk published a different data on /x at 0.6 s" in diff.sentence

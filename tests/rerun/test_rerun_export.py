@@ -288,6 +288,7 @@ def test_an_interrupted_run_is_shown_as_far_as_it_goes(tmp_path: Path) -> None:
     data = (tmp_path / "run.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
     done = export([tmp_path / "cut.mcap"], tmp_path / "cut.rrd")
+    assert f"it has only the first {done.events} events" in done.notes[0]
     cut = Recording(tmp_path / "cut.rrd")
     assert 4096 <= done.events < 15_000
     assert len(cut.rows["/events"]) == done.events
@@ -365,8 +366,8 @@ def test_topics_whose_types_ask_for_everything_are_left_out(
             part.record = record
     (tmp_path / "hostile.mcap").write_bytes(mcap_parts.put_together(parts))
     done = export([tmp_path / "hostile.mcap"], tmp_path / "run.rrd")
-    assert done.left_out
-    assert all(why in line for line in done.left_out)
+    assert done.notes
+    assert all(why in line for line in done.notes)
     assert len(Recording(tmp_path / "run.rrd").rows["/events"]) == done.events
 
 

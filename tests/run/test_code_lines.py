@@ -199,6 +199,32 @@ def test_what_was_not_looked_at_is_not_told_as_certain(tmp_path: Path) -> None:
     assert [late] in told  # another callback is looked at from its own first output on
 
 
+def test_the_lines_of_many_outputs_are_found_without_reading_all_for_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import rsltrace
+
+    (tmp_path / "burst.py").write_text(
+        "from rclpy.node import Node\n"
+        "from std_msgs.msg import String\n"
+        "class Burst(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('burst')\n"
+        "        out = self.create_publisher(String, 'x', 10)\n"
+        "        for _ in range(50):\n"
+        "            out.publish(String())\n"
+    )
+    (tmp_path / "job.yaml").write_text(
+        "nodes: [{node: 'burst:Burst'}]\nsearch_path: [.]\nstop: {time: 1 s}\n"
+    )
+    rsltrace.record(rsltrace.load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap")
+    with Trace.open(tmp_path / "run.mcap") as opened:
+        outputs = opened.outputs_of(0)
+        monkeypatch.setattr("rsltrace.trace.segments.output_of", None)
+        told = [output_places(opened, one) for one in outputs]
+    assert [one[0] for one in told if one].count("burst.py:8") == 50
+
+
 def test_each_place_is_told_once_and_where(trace: Path) -> None:
     with Trace.open(trace) as opened:
         for entity, lines in opened.code_lines.items():

@@ -335,7 +335,8 @@ def plain_mcap(path: Path, *, profile: str = "ros2", finish: bool = True) -> Pat
 def test_a_plain_bag_is_named_as_one(tmp_path: Path, finish: bool) -> None:
     path = plain_mcap(tmp_path / "bag.mcap", finish=finish)
     with pytest.raises(
-        TraceFormatError, match=r"plain MCAP recording .*somebody's writer.*bags: in a job"
+        TraceFormatError,
+        match=r"plain MCAP recording .*somebody's writer.*`rsltrace view`.*bags:",
     ):
         Trace.open(path)
 
@@ -355,7 +356,7 @@ def test_a_folder_and_a_bag_folder(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match=r"is a folder; name the \.mcap file in it"):
         Trace.open(tmp_path)
     (tmp_path / "metadata.yaml").write_text("")
-    with pytest.raises(TraceError, match="it holds a rosbag2 recording"):
+    with pytest.raises(TraceError, match="it holds a rosbag2 recording, which `rsltrace view`"):
         Trace.open(tmp_path)
 
 

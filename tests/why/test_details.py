@@ -16,9 +16,9 @@ from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.model.finding import decode_drops
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.phrases import exception_of
 from rsltrace.why.answer import why
 from rsltrace.why.filters import _spread
-from rsltrace.why.question import _said
 
 _TOPICS = st.lists(st.lists(st.integers(0, 50), min_size=1, max_size=4), min_size=2, max_size=3)
 
@@ -34,7 +34,7 @@ def test_the_nearest_stamps_are_those_of_all_choices(topics: list[list[int]]) ->
 def test_an_exception_of_several_lines_keeps_its_type_and_message() -> None:
     frame = '  File "a.py", line 3, in tick\n    raise ValueError(text)\n    ^^^^^\n'
     text = f"Traceback (most recent call last):\n{frame}ValueError: bad\n second line"
-    assert _said(text) == "ValueError: bad second line"
+    assert exception_of(text) == "ValueError: bad second line"
 
 
 @pytest.mark.ros

@@ -196,7 +196,7 @@ class Session:
     def nothing(self) -> str:
         if self.a.trace.complete:
             return "no events in this trace"
-        return "no events yet: a run writes some four thousand at a time"
+        return "no events: the run writes some four thousand at a time, or was killed before"
 
     def _events(self, place: int) -> list[Event]:
         """Return the events at a place, run a's first."""

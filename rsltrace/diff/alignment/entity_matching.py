@@ -1,13 +1,13 @@
 """Which entity of one run is which of the other.
 
-Ids count up in creation order, so one entity more shifts all ids after it. Entities are therefore
-matched by what they are: node, kind, name and type, and their number among equal ones.
+Ids count up in creation order, so one entity more shifts all ids after it. Nodes are therefore
+matched by name, other entities by node, kind, name and type, and their number among equal ones.
 Everything behind this module speaks of *numbers*, which mean the same entity in both runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import field
 from typing import Any
 
@@ -68,9 +68,9 @@ class EntityMatching:
 
 def match_entities(a: Trace, b: Trace) -> EntityMatching:
     """Match the entities of two runs. Reads all entities of both."""
-    classes_a, classes_b = _classes(a), _classes(b)
-    others = _other_names(a, b, same_nodes=classes_a.keys() == classes_b.keys())
-    keys_a, keys_b = _keys(a, classes_b, {}), _keys(b, classes_a, others)
+    nodes_a, nodes_b = _node_names(a), _node_names(b)
+    others = _other_names(a, b, same_nodes=nodes_a == nodes_b)
+    keys_a, keys_b = _keys(a, nodes_b, {}), _keys(b, nodes_a, others)
     by_key: dict[EntityKey, int] = {}
     for key in (*keys_a.values(), *keys_b.values()):
         by_key.setdefault(key, len(by_key))
@@ -96,10 +96,8 @@ def match_entities(a: Trace, b: Trace) -> EntityMatching:
     )
 
 
-def _classes(trace: Trace) -> dict[str, str]:
-    """Return the class of every node, by name."""
-    nodes = (entity for entity in trace.entities.values() if entity.kind is EntityKind.NODE)
-    return {node.name: node.type for node in nodes}
+def _node_names(trace: Trace) -> set[str]:
+    return {one.name for one in trace.entities.values() if one.kind is EntityKind.NODE}
 
 
 def _other_names(a: Trace, b: Trace, *, same_nodes: bool) -> dict[int, str]:
@@ -134,19 +132,19 @@ def _no_name(name: str) -> str:
 
 
 def _keys(
-    trace: Trace, other_classes: Mapping[str, str], names: Mapping[int, str]
+    trace: Trace, other_names: Container[str], names: Mapping[int, str]
 ) -> dict[int, EntityKey]:
     """Return the key of every entity, by id, in creation order; ``names`` are those to be used in
     place of entities' own.
 
-    A node whose constructor raised has no class in its trace: it is the node of its name.
+    A node is that of its name: its class may be another one, or unknown if its constructor raised.
     """
     seen: dict[tuple[str, str, str, str], int] = {}
     keys: dict[int, EntityKey] = {}
     for entity in trace.entities.values():
         kind = entity.type
-        if entity.kind is EntityKind.NODE and not kind:
-            kind = other_classes.get(entity.name, kind)
+        if entity.kind is EntityKind.NODE and entity.name in other_names:
+            kind = ""
         owner = trace.entities.get(entity.node)
         node = "" if owner is None else names.get(owner.id, owner.name)
         what = (node, entity.kind.label, names.get(entity.id, entity.name), kind)

@@ -62,6 +62,7 @@ from rsltrace.trace.words.code import output_places, relative_place
 from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.events import output_text
 from rsltrace.trace.words.logs import LogRecord
+from rsltrace.trace.words.phrases import exception_of
 
 MESSAGES_MAX = 50
 """Differing messages of one event that are decoded; one callback can publish thousands."""
@@ -216,7 +217,7 @@ class _MessageComparison:
                 return replace(base, no_fields=_NOT_RECORDED[run.of_b])
             values.append(value)
         if kind == OutputKind.EXCEPTION:
-            raised = [_last_line(value) for value in values]
+            raised = [_exception(value) for value in values]
             if len(raised) == 1:
                 return replace(base, preview=raised[0])
             return replace(base, fields=(FieldDifference("raised", raised[0], raised[1]),))
@@ -259,9 +260,8 @@ def _decision(number: int | None, digits: int) -> str:
     return "none" if number is None else decision_text(number, digits)
 
 
-def _last_line(traceback: object) -> str:
-    lines = str(traceback).strip().splitlines() or [""]
-    return shortened(printable(lines[-1]), _EXCEPTION_MAX)
+def _exception(traceback: object) -> str:
+    return shortened(printable(exception_of(str(traceback))), _EXCEPTION_MAX)
 
 
 def _log_text(record: object) -> str:

@@ -280,7 +280,7 @@ class MessageDifference:
     ``entity``. ``position`` is the output's place in its event, or -1 for the input. ``fields`` is
     empty when a payload was not recorded; ``no_fields`` then says so, ``error`` why it cannot be
     read. ``fate`` is what became of it. ``preview`` is the decoded message as one short line where
-    only one side has it (of an exception: its last line). A new entity has hash 0: it is known by
+    only one side has it (of an exception: type and text). A new entity has hash 0: it is known by
     name. ``code`` are the lines it may have come from (``module.py:31``), of both runs,
     ``elsewhere`` the last where the run did not look.
     """

@@ -139,6 +139,7 @@ class FileSource:
 def _folder_hint(path: Path) -> str:
     if (path / "metadata.yaml").exists():
         return (
-            "it holds a rosbag2 recording; a trace is one .mcap file that `rsltrace record` wrote"
+            "it holds a rosbag2 recording, which `rsltrace view` and `rsltrace diff` read; a trace "
+            "is one .mcap file that `rsltrace record` wrote"
         )
     return "name the .mcap file in it"

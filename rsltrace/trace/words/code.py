@@ -7,6 +7,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import (
     NO_SEQUENCE,
@@ -81,8 +83,10 @@ def output_places(trace: Trace, output: Output) -> list[str]:
     lines = trace.output_lines.get((output.entity, running), [])
     number = NO_SEQUENCE
     if any(line.event == output.event for line in lines):
-        outputs = trace.outputs_of(output.event)
-        numbers = [number for number, one in enumerate(outputs) if one == output]
+        rows = next(trace.outputs(output.event, output.event + 1))
+        fields = ("entity", "kind", "hash", "sequence")
+        same = [rows[name] == getattr(output, name) for name in fields]
+        numbers = np.flatnonzero(np.logical_and.reduce(same)).tolist()
         exact = [line for line in lines if line.event == output.event and line.output in numbers]
         if len(numbers) == 1 and exact and exact[0].place:
             return [exact[0].place]

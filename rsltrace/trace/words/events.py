@@ -21,6 +21,7 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import EntityNames
 from rsltrace.trace.words.kinds import kind_label
 from rsltrace.trace.words.logs import log_record
+from rsltrace.trace.words.phrases import exception_of
 
 _NAMELESS = frozenset((OutputKind.LOG, OutputKind.EXCEPTION, OutputKind.SHUTDOWN))
 """Kinds that are shown without a name: they belong to the event's node."""
@@ -114,11 +115,11 @@ class EventWords:
         return entity is not None and is_built_in(entity)
 
     def _detail(self, output: Output) -> str:
-        """Return the detail recorded with an output; of an exception the last line."""
+        """Return the detail recorded with an output; of an exception without its traceback."""
         try:
             detail = self._trace.detail(output) or ""
         except TraceError as error:
             detail = f"unreadable: {error}"
         if output.kind is OutputKind.EXCEPTION:
-            detail = (detail.strip().splitlines() or [""])[-1]
+            detail = exception_of(detail)
         return printable(detail.strip())

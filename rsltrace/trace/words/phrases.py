@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from rsltrace.trace.model.entity import EntityKind
@@ -11,6 +11,7 @@ from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import format_seconds, printable
 
 if TYPE_CHECKING:
+    from rsltrace.trace.reader import Trace
     from rsltrace.trace.words.entities import EntityKey
 
 
@@ -97,6 +98,25 @@ def as_sentence(text: str) -> str:
     text = printable(text).strip()
     text = text[:1].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def notes_on(trace: Trace) -> Iterator[str]:
+    """Yield what whoever reads results from a trace must know: how far a truncated one goes."""
+    if not trace.complete:
+        end = seconds_text(trace.end_ns - trace.start_ns)
+        yield (
+            f"{trace.name} is truncated (its run was killed, or still runs): it has only the first "
+            f"{trace.event_count} events, to {end} s"
+        )
+
+
+def exception_of(traceback: str) -> str:
+    """Return the type and message of the exception that a traceback ends with, in one line."""
+    lines = traceback.splitlines()
+    frames = [at for at, line in enumerate(lines) if line.startswith(("Traceback (", "  File "))]
+    after = lines[frames[-1] + 1 :] if frames else lines
+    first = next((at for at, line in enumerate(after) if line and not line.startswith(" ")), 0)
+    return " ".join(" ".join(after[first:]).split())
 
 
 def path_word(path: str) -> str:

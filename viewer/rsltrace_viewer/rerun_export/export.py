@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from threading import Thread
 
@@ -19,6 +20,7 @@ from rsltrace.trace.exports.output_file import check_output_file
 from rsltrace.trace.model.regular_file import replacement_of
 from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.phrases import notes_on
 from rsltrace_viewer.rerun_export.columns import clocks_for, joining_chunks
 from rsltrace_viewer.rerun_export.divergence import (
     Distances,
@@ -38,14 +40,14 @@ _PIECE_BYTES = 1 << 16
 class Exported:
     """What was written: events and bytes, of the traces and of the recording.
 
-    ``left_out`` says of which topics it has no messages, and why.
+    ``notes`` say of which topics it has no messages, and why, and how far a truncated trace goes.
     """
 
     path: Path
     events: int
     trace_bytes: int
     bytes: int
-    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def export(
@@ -83,7 +85,7 @@ def export(
             sum(trace.event_count for trace in opened),
             sum(trace.size for trace in opened),
             output.stat().st_size,
-            tuple(left_out),
+            (*chain.from_iterable(map(notes_on, opened)), *left_out),
         )
 
 

@@ -1,6 +1,6 @@
 // Stands before rmw, rcl's timers and tracetools in a process of a native run: passes every call on
 // to the real middleware, and notes it in a file that the run maps, too. What is in the file outlives
-// the process, however that ends. The other side is rsltrace/native/processes/programs.py.
+// the process, however that ends. The other side is rsltrace/native/processes/record_file.py.
 #include <dlfcn.h>
 #include <fcntl.h>
 #include <fnmatch.h>
