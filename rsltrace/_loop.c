@@ -238,9 +238,9 @@ static int is_next(const WholeLoop *self) {
 }
 
 static PyObject *receiver_of(PyObject *release) {
-  PyObject *function = Py_NewRef(PyTuple_GetItem(release, 3));
-  PyObject *receiver = call_one(function, release);
-  Py_DECREF(function);
+  PyObject *function = Py_XNewRef(PyTuple_GetItem(release, 3));
+  PyObject *receiver = function == NULL ? NULL : call_one(function, release);
+  Py_XDECREF(function);
   return receiver;
 }
 
