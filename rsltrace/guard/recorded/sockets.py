@@ -218,19 +218,10 @@ def recorded_sockets() -> Iterator[None]:
 def _record_tls(stack: ExitStack) -> None:
     module: Any = sys.modules["_ssl"]
     tls, memory = module._SSLSocket, module.MemoryBIO  # below ssl.SSLSocket and ssl.SSLObject
-    for name in _TLS:
-        replace_member(
-            stack,
-            tls,
-            name,
-            partial(recording_call, NondeterminismSource.SOCKET, f"TLS.{name}()"),
-        )
+    for owner, shown, names in ((tls, "TLS", _TLS), (memory, "MemoryBIO", _BUFFERED)):
+        for name in names:
+            call = f"{shown}.{name}()"
+            making = partial(recording_call, NondeterminismSource.SOCKET, call)
+            replace_member(stack, owner, name, making)
     replace_member(stack, tls, "read", _reading)
-    for name in _BUFFERED:
-        replace_member(
-            stack,
-            memory,
-            name,
-            partial(recording_call, NondeterminismSource.SOCKET, f"MemoryBIO.{name}()"),
-        )
     replace_member(stack, memory, "pending", _pending)
