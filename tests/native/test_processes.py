@@ -131,7 +131,8 @@ def test_every_message_has_its_cause(four: tuple[Trace, dict[str, Any]]) -> None
     trace, counted = four
     for name, own in counted.items():
         heard = callbacks(trace, name, "/numbers", EventKind.SUBSCRIPTION)
-        for event, number in zip(heard, own["got"], strict=True):
+        # The callback that the stop interrupts may not have counted: the test above allows one.
+        for event, number in zip(heard[: len(own["got"])], own["got"], strict=True):
             assert event.cause_event < event.index
             output = trace.outputs_of(event.cause_event)[event.cause_output]
             payload = trace.payload(output)
