@@ -23,7 +23,16 @@ _TEXT = '"""The version of this build."""\n\n__version__ = {version!r}\n'
 _MODULE = "rsltrace/_core.abi3.so"
 _FOLDER = Path(__file__).resolve().parent / "rsltrace"
 _SOURCES = sorted(_FOLDER.glob("_*.c"))
-_OPTIONS = ("-std=c11", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-Wall", "-Wextra")
+_OPTIONS = (
+    "-std=c11",
+    "-O3",
+    "-fPIC",
+    "-fno-plt",
+    "-shared",
+    "-fvisibility=hidden",
+    "-Wall",
+    "-Wextra",
+)
 
 
 class BuildOfRsltrace(BuildHookInterface):  # type: ignore[misc, valid-type]

@@ -27,7 +27,7 @@ enum {
 #define U32 0xFFFFFFFFu
 #define U64 UINT64_MAX
 
-/* -- XXH3-64 with a seed, of the two sizes that are hashed here ---------------------------------- */
+/* -- XXH3-64 of 8 to 64 bytes ------------------------------------------------------------------- */
 
 static const uint8_t SECRET[64] = {
     0xb8, 0xfe, 0x6c, 0x39, 0x23, 0xa4, 0x4b, 0xbe, 0x7c, 0x01, 0x81, 0x2c, 0xf7, 0x21, 0xad, 0x1c,
@@ -56,17 +56,25 @@ static uint64_t finished(uint64_t hash) {
   return hash ^ hash >> 32;
 }
 
-static uint64_t content_hash64(const uint8_t *data, uint64_t seed) {
-  const uint64_t low = at(data) ^ ((at(SECRET + 24) ^ at(SECRET + 32)) + seed);
-  const uint64_t high = at(data + 8) ^ ((at(SECRET + 40) ^ at(SECRET + 48)) - seed);
-  return finished(CONTENT + __builtin_bswap64(low) + high + folded(low, high));
+static uint64_t hash_of_8(uint64_t number) {
+  uint64_t hash = (number << 32 | number >> 32) ^ (at(SECRET + 8) ^ at(SECRET + 16));
+  hash = (hash ^ (hash << 49 | hash >> 15) ^ (hash << 24 | hash >> 40)) * 0x9FB21C651E98DF25;
+  hash = (hash ^ ((hash >> 35) + 8)) * 0x9FB21C651E98DF25;
+  return hash ^ hash >> 28;
 }
 
-static uint64_t rest_hash64(const uint8_t *data, uint64_t seed) {
-  return finished(REST * 0x9E3779B185EBCA87 + mixed(data, SECRET, seed) +
-                  mixed(data + REST - 16, SECRET + 16, seed) +
-                  mixed(data + 16, SECRET + 32, seed) +
-                  mixed(data + REST - 32, SECRET + 48, seed));
+/* Of 9 to 64 bytes: of so few, calling xxhash takes several times as long as what it does. */
+static uint64_t hash_of(const uint8_t *data, size_t size, uint64_t seed) {
+  uint64_t sum = size * 0x9E3779B185EBCA87;
+  if (size <= 16) {
+    const uint64_t low = at(data) ^ ((at(SECRET + 24) ^ at(SECRET + 32)) + seed);
+    const uint64_t high = at(data + size - 8) ^ ((at(SECRET + 40) ^ at(SECRET + 48)) - seed);
+    return finished(size + __builtin_bswap64(low) + high + folded(low, high));
+  }
+  for (size_t i = 0; 32 * i < size; ++i)
+    sum += mixed(data + 16 * i, SECRET + 32 * i, seed) +
+           mixed(data + size - 16 * (i + 1), SECRET + 32 * i + 16, seed);
+  return finished(sum);
 }
 
 /* -- RecordBuffer ------------------------------------------------------------------------------- */
@@ -439,7 +447,7 @@ static int chain_init(Chain *self, PyObject *args, PyObject *named) {
 }
 
 static int add_row(Chain *self, const uint8_t *row) {
-  self->output_hash = content_hash64(row, self->output_hash);
+  self->output_hash = hash_of(row, CONTENT, self->output_hash);
   if (self->buffer != NULL) {
     if (append(&self->buffer->contents, row, CONTENT) < 0) return -1;
   } else if (done(PyObject_CallFunction(self->add_output, "N", bytes_of(row, CONTENT))) < 0) {
@@ -532,7 +540,7 @@ static PyObject *chain_end_event(Chain *self, PyObject *const *args, Py_ssize_t 
   uint8_t row[EVENT] = {0}, *rest = row + 8;
   if (check_count("end_event", count, 7, 8) < 0 || pack_rest(self, args, count, rest) < 0)
     return NULL;
-  self->chain_hash = rest_hash64(rest, self->chain_hash);
+  self->chain_hash = hash_of(rest, REST, self->chain_hash);
   memcpy(row, &self->chain_hash, 8);
   if (self->buffer != NULL) {
     if (add_event(self->buffer, row) < 0) return NULL;
@@ -779,9 +787,9 @@ int record_draw(PyObject *recorder, PyObject *entity, unsigned long long draw) {
 }
 
 static int settle_entities(Dispatcher *self) {
-  const Py_ssize_t pending = PyObject_Length(self->pending);
-  if (pending <= 0) return (int)pending;
-  return done(PyObject_CallMethod(self->entities, "settle", "O", self->recorder));
+  if (PyList_CheckExact(self->pending) && PyList_Size(self->pending) == 0) return 0;
+  if (done(PyObject_CallMethod(self->entities, "settle", "O", self->recorder)) < 0) return -1;
+  return HAS_FIELDS(self, Dispatcher, dispatcher) ? 0 : -1;
 }
 
 static int tell_observers(Dispatcher *self) {
@@ -800,9 +808,7 @@ static int end_event(Dispatcher *self) {
   int failed = 1;
   Event *event;
   Loop *loop;
-  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || settle_entities(self) < 0 ||
-      !HAS_FIELDS(self, Dispatcher, dispatcher))
-    return -1;
+  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || settle_entities(self) < 0) return -1;
   event = (Event *)Py_NewRef(self->event);
   loop = (Loop *)Py_NewRef(self->loop);
   recorder = Py_NewRef(self->recorder);
@@ -949,12 +955,17 @@ static int send_to_all(Entity *self, PyObject *const *message, PyObject *now_ns,
   return failed;
 }
 
+static PyObject *digest_of(PyObject *data) {
+  const Py_ssize_t size = PyBytes_CheckExact(data) ? PyBytes_Size(data) : 0;
+  if (size < 9 || size > 64) return PyObject_CallFunctionObjArgs(hash64, data, NULL);
+  return PyLong_FromUnsignedLongLong(hash_of((uint8_t *)PyBytes_AsString(data), size, 0));
+}
+
 /* Records a message; returns its digest and its position in the event. */
 static int record_message(Entity *self, PyObject *recorder, PyObject *now_ns, PyObject *data,
                           PyObject *content_hash, PyObject **digest, PyObject **position) {
   PyObject *row[6];
-  *digest = content_hash != Py_None ? Py_NewRef(content_hash)
-                                    : PyObject_CallFunctionObjArgs(hash64, data, NULL);
+  *digest = content_hash != Py_None ? Py_NewRef(content_hash) : digest_of(data);
   if (*digest == NULL || !is_publisher((PyObject *)self)) return -1;
   row[0] = Py_NewRef(self->output_kind);
   row[1] = Py_NewRef(self->entity_id);
@@ -981,12 +992,12 @@ static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
     digest = Py_NewRef(zero);
     position = Py_NewRef(zero);
   }
-  failed = failed || !HAS_FIELDS(loop, Loop, loop) || !is_publisher((PyObject *)self);
+  failed = failed || set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 ||
+           !HAS_FIELDS(loop, Loop, loop) || !is_publisher((PyObject *)self);
   if (!failed) {
     PyObject *events = Py_NewRef(loop->events), *number = Py_NewRef(self->count);
     PyObject *message[] = {data, events, position, digest, now_ns, number};
-    failed = set(&loop->activity_ns, Py_NewRef(now_ns)) < 0 || !is_publisher((PyObject *)self) ||
-             send_to_all(self, message, now_ns, loop);
+    failed = send_to_all(self, message, now_ns, loop);
     Py_DECREF(number);
     Py_DECREF(events);
   }
@@ -1001,7 +1012,6 @@ static int send_plainly(Entity *self, Dispatcher *dispatcher, PyObject *data,
 static PyObject *publisher_send(Entity *self, PyObject *const *args, Py_ssize_t count) {
   PyObject *content_hash, *recorder;
   Dispatcher *dispatcher;
-  int failed;
   if (check_count("send", count, 1, 2) < 0 || !is_publisher((PyObject *)self)) return NULL;
   dispatcher = (Dispatcher *)self->dispatcher;
   if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) return NULL;
@@ -1014,7 +1024,7 @@ static PyObject *publisher_send(Entity *self, PyObject *const *args, Py_ssize_t 
        (self->channel == Py_None || !is_a(recorder, chain_type, &chain_seen))))
     return PyObject_CallMethod((PyObject *)self, "send_any", "OO", args[0], content_hash);
   Py_INCREF(dispatcher);
-  failed = send_plainly(self, dispatcher, args[0], content_hash);
+  const int failed = send_plainly(self, dispatcher, args[0], content_hash);
   Py_DECREF(dispatcher);
   return failed ? NULL : Py_NewRef(Py_None);
 }
@@ -1204,15 +1214,6 @@ static PyObject *next_deadline(int64_t now, int64_t deadline, int64_t period) {
   return PyLong_FromLongLong(deadline);
 }
 
-static PyObject *hash_of_deadline(int is_recorded, int64_t deadline) {
-  PyObject *packed, *hash;
-  if (!is_recorded) return Py_NewRef(zero);
-  packed = bytes_of((uint8_t *)&deadline, 8);
-  hash = packed == NULL ? NULL : PyObject_CallFunctionObjArgs(hash64, packed, NULL);
-  Py_XDECREF(packed);
-  return hash;
-}
-
 /* Notes which timer is first now. */
 static int find_first(TimerQueue *queue, PyObject *heap) {
   PyObject *first = PyList_Size(heap) > 0 ? PyList_GetItem(heap, 0) : Py_None, *timer;
@@ -1254,21 +1255,20 @@ static PyObject *timer_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
     Py_XDECREF(entry);
     return usual < 0 ? NULL : PyObject_CallMethod((PyObject *)self, "dispatch_any", NULL);
   }
-  const int is_recorded = dispatcher->recorder != Py_None;
-  PyObject *next = next_deadline(now, deadline, period), *cause[3] = {no_event, zero, NULL};
+  const uint64_t hash = dispatcher->recorder == Py_None ? 0 : hash_of_8((uint64_t)deadline);
+  PyObject *cause[3] = {no_event, zero, PyLong_FromUnsignedLongLong(hash)};
+  PyObject *next = next_deadline(now, deadline, period);
   PyObject *heap = Py_NewRef(queue->heap), *callback = Py_NewRef(self->callback);
   Py_INCREF(queue);
   /* Who holds all objects, as a profiler of memory may, makes these fail. */
-  failed = next == NULL || PyTuple_SetItem(entry, 0, Py_NewRef(next)) < 0 ||
+  failed = next == NULL || cause[2] == NULL || PyTuple_SetItem(entry, 0, Py_NewRef(next)) < 0 ||
            PyTuple_SetItem(entry, 1, Py_NewRef(state->order)) < 0 ||
            PyTuple_SetItem(entry, 2, Py_NewRef((PyObject *)state)) < 0 ||
            set(&state->last_call_ns, Py_NewRef(loop->now_ns)) < 0 ||
            set(&state->deadline_ns, Py_NewRef(next)) < 0 ||
            set(&state->ticket, Py_NewRef(entry)) < 0 ||
            done(call_two(heapreplace, heap, entry)) < 0 ||
-           find_first(queue, heap) < 0 ||
-           (cause[2] = hash_of_deadline(is_recorded, deadline)) == NULL ||
-           run_callback(self, TIMER, callback, no_args, cause);
+           find_first(queue, heap) < 0 || run_callback(self, TIMER, callback, no_args, cause);
   Py_DECREF(queue);
   Py_DECREF(callback);
   Py_DECREF(heap);
