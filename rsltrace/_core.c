@@ -1034,17 +1034,17 @@ static PyObject *publisher_send(Entity *self, PyObject *const *args, Py_ssize_t 
 static int is_site_due(Entity *self) {
   Dispatcher *dispatcher = (Dispatcher *)self->dispatcher;
   Sites *sites = (Sites *)self->sites;
-  PyObject *numbers[4];
-  int due;
+  PyObject *entity, *running;
+  uint64_t count, due_at;
   if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher) ||
-      !HAS_FIELDS(dispatcher->event, Event, event) || !HAS_FIELDS(sites, Sites, sites))
+      !HAS_FIELDS(dispatcher->event, Event, event) || !HAS_FIELDS(sites, Sites, sites) ||
+      read_number(self->count, &count) < 0 || read_number(sites->due, &due_at) < 0)
     return -1;
-  numbers[0] = self->count, numbers[1] = sites->due;
-  numbers[2] = ((Event *)dispatcher->event)->entity, numbers[3] = sites->running;
-  for (int i = 0; i < 4; ++i) Py_INCREF(numbers[i]);
-  due = PyObject_RichCompareBool(numbers[0], numbers[1], Py_EQ);
-  if (due == 0) due = PyObject_RichCompareBool(numbers[2], numbers[3], Py_NE);
-  for (int i = 0; i < 4; ++i) Py_DECREF(numbers[i]);
+  if (count == due_at) return 1;
+  entity = Py_NewRef(((Event *)dispatcher->event)->entity), running = Py_NewRef(sites->running);
+  const int due = PyObject_RichCompareBool(entity, running, Py_NE);
+  Py_DECREF(running);
+  Py_DECREF(entity);
   return due;
 }
 
