@@ -207,6 +207,11 @@ def test_going_to_a_time_and_an_index(made: Path, run: Run, drive: Drive) -> Non
         assert not viewer.app.prompt.asking
         await viewer.press("i")
         await viewer.type("1,000,000")
+        assert viewer.app.prompt.asking
+        assert f"no event 1000000 (events: 0 to {run.count - 1})" in viewer.text
+        await viewer.press("escape")
+        await viewer.press("i")
+        await viewer.type(f"{run.count - 1}")
         assert viewer.place == run.count - 1
 
     drive(made, steps)

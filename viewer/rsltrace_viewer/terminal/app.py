@@ -123,8 +123,8 @@ class ViewerApp(Stepping):
                 self.go(self.session.place_at_time(time), centre=True)
             else:
                 name, index = parse_index(event.text)
-                run = self.session.runs.get(name) or next(iter(self.session.shown.values()))
-                self._go_to_event(min(index, run.count - 1), other=run is self.session.b)
+                run = self.session.run_named(name)
+                self._go_to_event(index, other=run is self.session.b)
 
     def _filter(self, text: str) -> None:
         rows = self.session.set_filter(text)

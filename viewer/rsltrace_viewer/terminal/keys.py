@@ -142,6 +142,14 @@ LIVE_KEYS: tuple[Key, ...] = (
 _SHOWN = {"next": "↓↑", "cause": "c", "effects": "e"}
 
 
+def key_names() -> set[str]:
+    """Return the names that Textual gives to keys: ``down``, ``slash`` …"""
+    from textual.keys import Keys, _character_to_key
+
+    signs = {_character_to_key(chr(code)) for code in range(ord(" "), 127)}
+    return signs | {str(key.value) for key in Keys}
+
+
 def keys_of(*, two: bool, live: bool) -> list[Key]:
     """Return the keys that do something: with two traces, with a run that goes on."""
     found = [key for key in KEYS if two or not key.two]
