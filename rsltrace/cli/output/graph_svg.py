@@ -217,7 +217,7 @@ def _ways_back(
 ) -> dict[int, tuple[float, float, float]]:
     """Return where edges go back, by number: right of the column of their source, below all boxes,
     left of the column of their target."""
-    ways = {}
+    ways: dict[int, tuple[float, float, float]] = {}
     for number, edge in enumerate(edges):
         if edge.back:
             source, target = boxes[edge.source].x, boxes[edge.target].x
