@@ -13,6 +13,7 @@ import subprocess
 import sys
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -31,6 +32,7 @@ from trace_maker import (
 
 from rsltrace.cli.main import cli
 from rsltrace.guard.pin import THREAD_VARIABLES
+from rsltrace.terminal import terminal_width
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
@@ -207,6 +209,27 @@ def test_info_finds_an_environment_that_was_changed(
 
 def test_cat_of_a_run(run: tuple[Path, Feeder]) -> None:
     golden("cat.txt", output("cat", run[0]))
+
+
+def test_cat_leaves_out_hashes_where_a_terminal_has_no_room_for_outputs(
+    run: tuple[Path, Feeder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = lines(run[0])
+    both = re.search(r"  [0-9a-f]{16}  [0-9a-f]{16}(?=  )", whole[2])
+    assert both is not None
+    start = both.start()
+    without = [line[:start] + line[start + len(both[0]) :] for line in whole]
+    for columns, shown in ((119, without), (130, whole)):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        monkeypatch.setattr("rsltrace.cli.cat.terminal_width", lambda: width_of(True))
+        assert [line.split() for line in lines(run[0])] == [line.split() for line in shown]
+    assert width_of(False) is None
+
+
+def width_of(is_terminal: bool) -> int | None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", SimpleNamespace(isatty=lambda: is_terminal))
+        return terminal_width()
 
 
 def test_cat_of_an_interrupted_run_is_that_of_the_whole(
