@@ -437,6 +437,8 @@ def test_printable_keeps_what_can_be_printed() -> None:
 def test_tables_are_aligned_and_end_without_spaces() -> None:
     rows = [("a", "1", ""), ("bbb", "22", "x")]
     assert table(rows, right=frozenset((1,))) == ["a     1", "bbb  22  x"]
+    long = "/robot" * 20
+    assert table([("a", "1"), ("bbb", "2"), (long, "3")]) == ["a    1", "bbb  2", f"{long}  3"]
 
 
 # -- the command -----------------------------------------------------------------------------
