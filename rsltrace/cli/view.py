@@ -190,6 +190,7 @@ def _opened(
     from rsltrace_viewer.live.state import LiveSession
     from rsltrace_viewer.model.run import Run
 
+    from rsltrace.cli.output.search_progress import working
     from rsltrace.cli.replay import agree
     from rsltrace.debug.client import DebugSession
     from rsltrace.replay.preparation import prepare_replay
@@ -198,7 +199,8 @@ def _opened(
         agree(plan, trust=trust)
     run = Run.open(traces[0])
     stack.callback(run.close)
-    debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=True))
+    with working("starting the run"):
+        debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=True))
     shown = LiveSession(run)
     return shown, partial(LiveApp, shown, Execution(debugged, run))
 

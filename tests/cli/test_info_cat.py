@@ -240,6 +240,16 @@ def test_cat_of_an_interrupted_run_is_that_of_the_whole(
     assert [line.split() for line in cut] == [line.split() for line in whole]
 
 
+def test_of_a_trace_without_events_it_says_that_there_are_none(
+    run: tuple[Path, Feeder], tmp_path: Path
+) -> None:
+    data = run[0].read_bytes()
+    offsets = boundaries(data)
+    first = opcodes(data, offsets).index(0x06)
+    (tmp_path / "cut.mcap").write_bytes(data[: offsets[first]])
+    assert call("cat", tmp_path / "cut.mcap").stderr.endswith("still runs): it has no events\n")
+
+
 @pytest.mark.parametrize("command", ["cat", "check", "latency", "why"])
 def test_what_is_read_from_a_truncated_trace_says_so(
     run: tuple[Path, Feeder], interrupted: Path, command: str

@@ -111,9 +111,10 @@ def notes_on(trace: Trace) -> Iterator[str]:
     """Yield what whoever reads results from a trace must know: how far a truncated one goes."""
     if not trace.complete:
         end = seconds_text(trace.end_ns - trace.start_ns)
+        has = f"only the first {trace.event_count} events, to {end} s"
         yield (
-            f"{trace.name} is truncated (its run was killed, or still runs): it has only the first "
-            f"{trace.event_count} events, to {end} s"
+            f"{trace.name} is truncated (its run was killed, or still runs): it has "
+            f"{has if trace.event_count else 'no events'}"
         )
 
 

@@ -130,7 +130,7 @@ LIVE_KEYS: tuple[Key, ...] = (
         ". , run",
         1,
     ),
-    Key("comma", ",", "run(-1)", "run back to the last breakpoint, or to the begin", RUN),
+    Key("comma", ",", "run(-1)", "run back to the last breakpoint, or to the start", RUN),
     Key("B", "B", "ask('breakpoint')", "set a breakpoint", RUN, "break", 1),
     Key("D", "D", "clear", "remove a breakpoint", RUN),
     Key("V", "V", "ask('watch')", "watch an expression in the node", RUN, "watch", 2),
