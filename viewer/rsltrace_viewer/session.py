@@ -672,6 +672,8 @@ class Session:
         reason = trace.result.get("exit_code", "0")
         if len(runs) == 1 and reason != "0":
             parts.append(f"exit code {reason}")
+        if self.empty:
+            return "  ".join(parts)
         how = "of real time" if is_native(trace) else "simulated"
         parts.append(f"{format_duration(run.end_ns - run.start_ns)} {how}")
         if run.base_ns:
