@@ -32,6 +32,15 @@ def tell_notes(notes: Iterable[str]) -> None:
         tell(printable(f"rsltrace: note: {note}"))
 
 
+def terminal_width() -> int | None:
+    """Return how many columns the terminal has that answers go to, None if they go elsewhere."""
+    if not sys.stdout.isatty():
+        return None
+    import shutil  # not everyone looks at a terminal
+
+    return shutil.get_terminal_size().columns
+
+
 def line_writer() -> Callable[[str], object]:
     """Return what writes a line of many to stdout, without pushing each of them through."""
     write = sys.stdout.write

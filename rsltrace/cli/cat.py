@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError, near_or_all
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.terminal import line_writer, tell_notes
+from rsltrace.terminal import line_writer, tell_notes, terminal_width
 from rsltrace.trace.format import TOPIC_DETAILS
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import (
@@ -137,6 +137,8 @@ class EventJson:
 _VALUE_MAX = 200
 _COLUMN_MAX = 40
 """A column is as wide as its longest name, up to here; longer names push the rest to the right."""
+_HASHES, _OUTPUTS_MIN = 60, 30
+"""How wide the hashes, the kind and the gaps are; and what is to be left for the outputs."""
 
 
 class EventLines:
@@ -144,10 +146,10 @@ class EventLines:
 
     Columns without a value hold ``-``; outputs and flags come last because their length varies.
     With ``code``, the source line of the callback comes before the outputs, and each output has its
-    own.
+    own. Where hashes would leave no room for outputs in a ``width``, they are left out.
     """
 
-    def __init__(self, trace: Trace, *, code: bool = False) -> None:
+    def __init__(self, trace: Trace, *, code: bool = False, width: int | None = None) -> None:
         self._trace = trace
         made = (entity.source for entity in trace.entities.values())
         ran = (line.place for lines in trace.code_lines.values() for line in lines)
@@ -163,6 +165,8 @@ class EventLines:
         self._time_width = max(len(format_seconds(at - self._start_ns)) for at in ends)
         self._node_width = min(max(names.longest_node, 1), _COLUMN_MAX)
         self._name_width = min(max(names.longest_name, 1), _COLUMN_MAX)
+        before = self._index_width + self._time_width + self._node_width + self._name_width
+        self._hashes = width is None or before + _HASHES + _OUTPUTS_MIN <= width
 
     def line(self, event: EventRecord, outputs: list[Output]) -> str:
         """Return the line of an event, then a line for each finding of the guard in it."""
@@ -171,9 +175,10 @@ class EventLines:
         columns = (
             f"{event.index:>{self._index_width}}  "
             f"{format_seconds(event.stamp_ns - self._start_ns):>{self._time_width}}  "
-            f"{node:<{self._node_width}}  {event.kind.label:<15}  {name:<{self._name_width}}  "
-            f"{_hex(event.input_hash):<16}  {_hex(event.output_hash):<16}"
+            f"{node:<{self._node_width}}  {event.kind.label:<15}  {name:<{self._name_width}}"
         )
+        if self._hashes:
+            columns += f"  {_hex(event.input_hash):<16}  {_hex(event.output_hash):<16}"
         if self._code_width:
             place = printable(places_text(code_places(self._trace, event))) or "-"
             columns += f"  {place:<{self._code_width}}"
@@ -288,8 +293,9 @@ def cat(
 
     The columns are: index, seconds since the start of the run, node, kind, entity, hash of the
     input, hash of the outputs, outputs (/topic, call /service, reply /service, log LEVEL text and
-    so on), and [flags]. A line that starts with "!" is a finding of the guard in the event above
-    it. Built-in entities of rclpy (such as /rosout) are shown only as a count; --json lists them.
+    so on), and [flags]. A narrow terminal shows no hashes. A line that starts with "!" is a finding
+    of the guard in the event above it. Built-in entities of rclpy (such as /rosout) are shown only
+    as a count; --json lists them.
 
     All filter options are repeatable, except times. An event is printed if it matches at least one
     value of every option given. Globs match whole names: --topic '/robot1/*'.
@@ -302,7 +308,8 @@ def cat(
         condition = None if where is None else _condition(where, opened)
         events = _events(opened, choice, condition)
         write = line_writer()
-        form = _json_form(opened, payloads) if as_json else EventLines(opened, code=code).line
+        lines = EventLines(opened, code=code, width=terminal_width())
+        form = _json_form(opened, payloads) if as_json else lines.line
         for event, outputs in islice(events, limit):
             write(form(event, outputs))
 

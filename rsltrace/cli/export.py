@@ -111,9 +111,9 @@ def export(
         tell(f"wrote {bag}: {count} messages")
     if whole:
         return 0
-    what = "export" if bag is None else "bag"
-    tell(
-        f"rsltrace: note: {trace} is truncated: the {what} ends with it after {events} events, "
-        f"at {end} s"
-    )
+    # Messages are in the file before the events that sent them.
+    ends = f"the export ends with it after {events} events, at {end} s"
+    if bag is not None:
+        ends = f"the bag has only the {count} messages before the cut"
+    tell(f"rsltrace: note: {trace} is truncated: {ends}")
     return EXIT_TRUNCATED

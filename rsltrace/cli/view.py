@@ -18,7 +18,7 @@ import click
 from rsltrace.cli.options import job_folder_option, trust_option
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.diff.file_kind import is_recording
-from rsltrace.errors import OutputError, SetupError, TraceError
+from rsltrace.errors import OutputError, SetupError, TraceError, did_you_mean
 from rsltrace.terminal import tell
 
 if TYPE_CHECKING:
@@ -104,6 +104,8 @@ def view(
     to quit.
     """
     _check_installed("textual")
+    if keys and export is None:
+        raise click.UsageError("--keys needs --export")
     if len(traces) > 2:
         raise click.UsageError("view shows one trace or compares two; `rsltrace diff` takes more")
     if follow and len(traces) > 1:
@@ -188,6 +190,7 @@ def _opened(
     from rsltrace_viewer.live.state import LiveSession
     from rsltrace_viewer.model.run import Run
 
+    from rsltrace.cli.output.search_progress import working
     from rsltrace.cli.replay import agree
     from rsltrace.debug.client import DebugSession
     from rsltrace.replay.preparation import prepare_replay
@@ -196,7 +199,8 @@ def _opened(
         agree(plan, trust=trust)
     run = Run.open(traces[0])
     stack.callback(run.close)
-    debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=True))
+    with working("starting the run"):
+        debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=True))
     shown = LiveSession(run)
     return shown, partial(LiveApp, shown, Execution(debugged, run))
 
@@ -246,10 +250,16 @@ def _choose(*, exporting: bool, light: bool) -> tuple[Path, ...]:
 
 
 def _place(session: Any, at: str) -> int:
-    if at.isdecimal():
-        return int(session.view.place_of(min(int(at), max(session.a.count - 1, 0))))
-    time = _time(at, "an event")
-    return int(session.place_at_time(time)) if not session.empty else 0
+    from rsltrace_viewer.terminal.choose import question_of
+
+    time = None if at.isdecimal() else _time(at, "an event")
+    if session.empty:
+        return 0
+    try:
+        question_of("index" if time is None else "time", session).check(at)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--at") from None
+    return int(session.view.place_of(int(at)) if time is None else session.place_at_time(time))
 
 
 def _time(at: str, what: str) -> TimeInRun:
@@ -284,8 +294,15 @@ def _parse_size(text: str) -> tuple[int, int]:
 def _export(app: Shown, path: Path, size: tuple[int, int], keys: list[str]) -> None:
     if path.suffix not in (".svg", ".txt"):
         raise click.BadParameter(f"{path} should end in .svg or .txt", param_hint="--export")
+    from rsltrace_viewer.terminal.keys import key_names
     from rsltrace_viewer.terminal.screenshot import screen_of
 
+    known = key_names()
+    for key in keys:
+        name = key.rpartition("+")[2]
+        if len(name) > 1 and name not in known:
+            hint = did_you_mean(name, known, "keys are named like down, pagedown, slash, ctrl+p")
+            raise click.BadParameter(f"there is no key {key!r}; {hint}", param_hint="--keys")
     picture = screen_of(app, size, keys, svg=path.suffix == ".svg")
     write_text(path, picture)
 

@@ -131,7 +131,7 @@ class CheckpointTree:
         """Return the session to its position after its process ended."""
         self.family.kill(self._cursor)
         index = int(before["index"])
-        where = f"somewhere after event {index - 1}" if index else "at the begin"
+        where = f"somewhere after event {index - 1}" if index else "at the start"
         for is_last in (False, True):  # who kills one process may just have killed another
             try:
                 self._cursor, answer = self._at({"until": index})

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -31,6 +32,7 @@ from trace_maker import (
 
 from rsltrace.cli.main import cli
 from rsltrace.guard.pin import THREAD_VARIABLES
+from rsltrace.terminal import terminal_width
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
@@ -209,12 +211,43 @@ def test_cat_of_a_run(run: tuple[Path, Feeder]) -> None:
     golden("cat.txt", output("cat", run[0]))
 
 
+def test_cat_leaves_out_hashes_where_a_terminal_has_no_room_for_outputs(
+    run: tuple[Path, Feeder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = lines(run[0])
+    both = re.search(r"  [0-9a-f]{16}  [0-9a-f]{16}(?=  )", whole[2])
+    assert both is not None
+    start = both.start()
+    without = [line[:start] + line[start + len(both[0]) :] for line in whole]
+    for columns, shown in ((119, without), (130, whole)):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        monkeypatch.setattr("rsltrace.cli.cat.terminal_width", lambda: width_of(True))
+        assert [line.split() for line in lines(run[0])] == [line.split() for line in shown]
+    assert width_of(False) is None
+
+
+def width_of(is_terminal: bool) -> int | None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", SimpleNamespace(isatty=lambda: is_terminal))
+        return terminal_width()
+
+
 def test_cat_of_an_interrupted_run_is_that_of_the_whole(
     run: tuple[Path, Feeder], interrupted: Path
 ) -> None:
     whole = output("cat", run[0]).splitlines()
     cut = output("cat", interrupted).splitlines()
     assert [line.split() for line in cut] == [line.split() for line in whole]
+
+
+def test_of_a_trace_without_events_it_says_that_there_are_none(
+    run: tuple[Path, Feeder], tmp_path: Path
+) -> None:
+    data = run[0].read_bytes()
+    offsets = boundaries(data)
+    first = opcodes(data, offsets).index(0x06)
+    (tmp_path / "cut.mcap").write_bytes(data[: offsets[first]])
+    assert call("cat", tmp_path / "cut.mcap").stderr.endswith("still runs): it has no events\n")
 
 
 @pytest.mark.parametrize("command", ["cat", "check", "latency", "why"])
@@ -414,6 +447,8 @@ def test_printable_keeps_what_can_be_printed() -> None:
 def test_tables_are_aligned_and_end_without_spaces() -> None:
     rows = [("a", "1", ""), ("bbb", "22", "x")]
     assert table(rows, right=frozenset((1,))) == ["a     1", "bbb  22  x"]
+    long = "/robot" * 20
+    assert table([("a", "1"), ("bbb", "2"), (long, "3")]) == ["a    1", "bbb  2", f"{long}  3"]
 
 
 # -- the command -----------------------------------------------------------------------------

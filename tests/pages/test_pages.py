@@ -142,6 +142,7 @@ def test_texts_of_any_length_make_no_large_page(
 def test_the_page_of_a_run_has_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(SAMPLES / "missing_event")
     text = made("info", "b.mcap")
+    assert ["name", "events", "Hz", "share"] in Page(text).rows, "a node is not of a node"
     contained(text)
     page = Page(text)
     with Trace.open("b.mcap") as trace:

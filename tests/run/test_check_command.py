@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
@@ -326,16 +327,28 @@ def test_an_arrow_back_has_one_head_and_a_way_of_its_own() -> None:
         GraphLink("topic", "/odom", "", (drive,), (plan,)),
         GraphLink("topic", "/own", "", (plan,), (plan,)),
     )
-    paths = [
-        e.attrib
-        for e in ET.fromstring(graph_svg(GraphOverview(nodes, links))).iter()
-        if "d" in e.attrib
-    ]
+    parts = [e.attrib for e in ET.fromstring(graph_svg(GraphOverview(nodes, links))).iter()]
+    paths = [part for part in parts if "d" in part]
     arrows = [path for path in paths if path.get("class", "").startswith("edge")]
     assert len(arrows) == 6
     assert all("marker-end" in arrow and "marker-start" not in arrow for arrow in arrows)
     back = [arrow for arrow in arrows if "back" in arrow["class"]]
     assert len(back) == 2  # one closes the loop of two nodes, one that of a node with itself
-    begins = {arrow["d"].split(" C")[0] for arrow in arrows if arrow not in back}
-    ends = {" ".join(arrow["d"].split()[-2:]) for arrow in back}
-    assert not {begin[1:] for begin in begins} & ends
+    boxes = [
+        {name: float(part[name]) for name in ("x", "y", "width", "height")}
+        for part in parts
+        if "rx" in part
+    ]
+    assert len(boxes) == 5
+    bottom = max(box["y"] + box["height"] for box in boxes)
+    lowest = set()
+    for arrow in back:  # it comes from the left, as others do, and passes no box
+        numbers = [float(number) for number in re.findall(r"-?[\d.]+", arrow["d"])]
+        points = [*zip(numbers[::2], numbers[1::2], strict=True)]
+        assert points[-2][0] < points[-1][0]
+        assert points[-2][1] == points[-1][1]
+        lowest.add(max(y for _, y in points))
+        for x, _ in points[1:-1]:
+            assert not any(box["x"] <= x <= box["x"] + box["width"] for box in boxes)
+    assert min(lowest) > bottom
+    assert len(lowest) == 2, "one would be taken for the other"

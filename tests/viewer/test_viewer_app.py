@@ -16,7 +16,7 @@ from rsltrace_viewer.model.query.conditions import ANY_LOG, find
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.terminal import screenshot
 from rsltrace_viewer.terminal.app import ViewerApp
-from rsltrace_viewer.terminal.keys import KEYS
+from rsltrace_viewer.terminal.keys import KEYS, LOOK, MOVE
 from rsltrace_viewer.terminal.screens.help import HelpScreen
 from rsltrace_viewer.terminal.screens.plot import PlotScreen, PlotView
 from rsltrace_viewer.terminal.screens.report import ReportScreen
@@ -207,6 +207,11 @@ def test_going_to_a_time_and_an_index(made: Path, run: Run, drive: Drive) -> Non
         assert not viewer.app.prompt.asking
         await viewer.press("i")
         await viewer.type("1,000,000")
+        assert viewer.app.prompt.asking
+        assert f"no event 1000000 (events: 0 to {run.count - 1})" in viewer.text
+        await viewer.press("escape")
+        await viewer.press("i")
+        await viewer.type(f"{run.count - 1}")
         assert viewer.place == run.count - 1
 
     drive(made, steps)
@@ -370,6 +375,19 @@ def test_help_lists_every_key_and_any_of_its_keys_closes_it(made: Path, drive: D
             assert not isinstance(viewer.app.screen, HelpScreen)
 
     drive(made, steps, size=(140, 60))
+
+
+def test_the_help_of_a_resized_screen_has_the_columns_it_has_room_for(
+    made: Path, drive: Drive
+) -> None:
+    async def steps(viewer: Any) -> None:
+        await viewer.press("question_mark")
+        for width, beside in ((60, False), (140, True), (80, False)):
+            await viewer.resize(width, 40)
+            line = next(line for line in viewer.text.splitlines() if MOVE in line)
+            assert (LOOK in line) == beside, viewer.text
+
+    drive(made, steps, size=(120, 40))
 
 
 @pytest.mark.long

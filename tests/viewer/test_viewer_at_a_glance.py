@@ -274,6 +274,7 @@ def test_the_source_of_a_callback_and_that_it_has_changed(
         code.unlink()
         await viewer.press("E", "s")
         assert "not below this folder" in viewer.text
+        assert "the job is" in viewer.text, "the note is wrapped"
 
     drive(folder / "run.mcap", steps, start=index)
     run.close()

@@ -270,7 +270,12 @@ def test_a_filter_of_two_recordings_keeps_what_either_has(bags: tuple[Path, Path
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("at", "expected"),
-    [("1.445s", ("/pose", 144)), ("0", ("", 0)), ("99999", ("", -1)), ("99s", ("", -1))],
+    [
+        ("1.445s", ("/pose", 144)),
+        ("0", ("", 0)),
+        ("99999", ("", -1)),
+        ("99s", ("", -1)),
+    ],
 )
 def test_starting_somewhere_in_a_recording(
     bags: tuple[Path, Path], tmp_path: Path, at: str, expected: tuple[str, int]
@@ -290,7 +295,9 @@ def test_starting_somewhere_in_a_recording(
     screen = tmp_path / "screen.txt"
     done = CliRunner().invoke(cli, ["view", str(bags[0]), "--at", at, "--export", str(screen)])
     assert done.exit_code == 0, done.output
-    assert f"message {number}" in screen.read_text()
+    shown = screen.read_text()
+    assert f"message {number}" in shown
+    assert ("this is the last" in shown) == (expected[1] == -1)
 
 
 def test_the_chooser_knows_recordings(

@@ -127,3 +127,5 @@ def test_a_trace_that_has_no_segment_yet(tmp_path: Path) -> None:
     (tmp_path / "begun.mcap").write_bytes(path.read_bytes()[:400])
     text = screen(tmp_path / "begun.mcap", "--export", tmp_path / "screen.txt")
     assert "no events: the run writes some four thousand at a time, or was killed before" in text
+    assert "0 events  not finished" in text
+    assert "digest" not in text, "there is none yet"

@@ -608,6 +608,10 @@ class Session:
         beyond = [place for place in places if (place - self.place) * step > 0]
         return min(beyond, key=lambda place: abs(place - self.place), default=None)
 
+    def run_named(self, name: str) -> Run:
+        """Return run ``a`` or ``b``; without a name, the first that is shown."""
+        return self.runs.get(name) or next(iter(self.shown.values()))
+
     def place_at_time(self, time: TimeInRun) -> int:
         """Return the place of the first event at a time or later; of the last one if none is."""
         return self._place_at(lambda run: time.stamp_ns(run.trace.start_ns, run.end_ns))
@@ -668,6 +672,8 @@ class Session:
         reason = trace.result.get("exit_code", "0")
         if len(runs) == 1 and reason != "0":
             parts.append(f"exit code {reason}")
+        if self.empty:
+            return "  ".join(parts)
         how = "of real time" if is_native(trace) else "simulated"
         parts.append(f"{format_duration(run.end_ns - run.start_ns)} {how}")
         if run.base_ns:

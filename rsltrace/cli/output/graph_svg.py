@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from itertools import pairwise
+from math import atan2, cos, hypot, sin
 from typing import Literal
 from xml.sax.saxutils import escape
 
@@ -23,8 +24,8 @@ _ROW = 54.0
 _BOX_HEIGHT = 28.0
 _GAP = 70.0
 _MARGIN = 24.0
-_BACK = 34.0
-"""How far below the boxes an arrow goes back."""
+_BACK, _CORNER = 14.0, 8.0
+"""How far from the boxes an arrow goes back, and how round its corners are."""
 
 _STYLE = """\
 text { font: 12px ui-monospace, "DejaVu Sans Mono", monospace; fill: #1f2328; }
@@ -64,8 +65,8 @@ class _Box:
 @dataclass
 class _Edge:
     """An arrow between boxes. ``incompatible`` names the policies for which it never connects.
-    ``back`` goes against the direction of the picture: it runs below the boxes, so that no arrow
-    seems to have a head at either end."""
+    ``back`` goes against the direction of the picture: it runs around the boxes, so that no arrow
+    seems to have a head at either end, or to come from a box that it passes."""
 
     source: int
     target: int
@@ -211,13 +212,29 @@ def _place_alone(boxes: list[_Box], edges: list[_Edge]) -> None:
         x += box.width + 30
 
 
+def _ways_back(
+    boxes: list[_Box], edges: list[_Edge], bottom: float
+) -> dict[int, tuple[float, float, float]]:
+    """Return where edges go back, by number: right of the column of their source, below all boxes,
+    left of the column of their target."""
+    ways: dict[int, tuple[float, float, float]] = {}
+    for number, edge in enumerate(edges):
+        if edge.back:
+            source, target = boxes[edge.source].x, boxes[edge.target].x
+            right = max(box.x + box.width / 2 for box in boxes if box.x == source) + _BACK
+            left = min(box.x - box.width / 2 for box in boxes if box.x == target) - 1.5 * _BACK
+            ways[number] = right, bottom + _BACK * len(ways), left
+    return ways
+
+
 def _svg(boxes: list[_Box], edges: list[_Edge], in_page: bool) -> Iterator[str]:
     points = [(x, y) for edge in edges for x, y in edge.through]
-    left = min([box.x - box.width / 2 for box in boxes] + [x for x, _ in points] + [0.0])
-    right = max([box.x + box.width / 2 for box in boxes] + [x for x, _ in points] + [0.0])
-    top = min([box.y for box in boxes] + [y for _, y in points] + [0.0]) - _BOX_HEIGHT
-    bottom = max([box.y for box in boxes] + [y for _, y in points] + [0.0]) + _BOX_HEIGHT
-    bottom += _BACK + (right - left) * 0.05 if any(edge.back for edge in edges) else 0.0
+    left = min([box.x - box.width / 2 for box in boxes] + [x for x, _ in points], default=0.0)
+    right = max([box.x + box.width / 2 for box in boxes] + [x for x, _ in points], default=0.0)
+    rows = [box.y for box in boxes] + [y for _, y in points]
+    top, bottom = min(rows, default=0.0) - _BOX_HEIGHT, max(rows, default=0.0) + _BOX_HEIGHT
+    ways = _ways_back(boxes, edges, bottom)
+    bottom = max([bottom, *(below for _, below, _ in ways.values())])
     width, height = right - left + 2 * _MARGIN, bottom - top + 2 * _MARGIN
     yield (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
@@ -235,16 +252,17 @@ def _svg(boxes: list[_Box], edges: list[_Edge], in_page: bool) -> Iterator[str]:
             f'<rect x="{left - _MARGIN:.1f}" y="{top - _MARGIN:.1f}" width="{width:.1f}" '
             f'height="{height:.1f}" fill="#ffffff"/>'
         )
-    for edge in edges:
-        yield _path(boxes[edge.source], boxes[edge.target], edge)
+    for number, edge in enumerate(edges):
+        yield _path(boxes[edge.source], boxes[edge.target], edge, ways.get(number))
     for box in boxes:
         yield _drawn(box)
     yield "</svg>"
 
 
-def _path(source: _Box, target: _Box, edge: _Edge) -> str:
-    path = _around(source, target) if edge.back else _straight(source, target, edge)
-    style = "edge back" if edge.back else "edge"
+def _path(source: _Box, target: _Box, edge: _Edge, way: tuple[float, float, float] | None) -> str:
+    """``way`` is what ``_around`` gets, of an edge that goes back."""
+    path = _straight(source, target, edge) if way is None else _around(source, target, *way)
+    style = "edge" if way is None else "edge back"
     style += " apart" if edge.incompatible else ""
     title = (
         f"<title>does not connect: {escape(edge.incompatible)}</title>" if edge.incompatible else ""
@@ -252,13 +270,24 @@ def _path(source: _Box, target: _Box, edge: _Edge) -> str:
     return f'<path class="{style}" d="{path}" marker-end="url(#head)">{title}</path>'
 
 
-def _around(source: _Box, target: _Box) -> str:
-    """Return a way back: out of the bottom of one box, into that of another."""
-    aside = 10.0 if source.x == target.x else 0.0
-    ax, bx = source.x + aside, target.x - aside
-    ay, by = source.y + _BOX_HEIGHT / 2, target.y + _BOX_HEIGHT / 2
-    low = max(ay, by) + _BACK + abs(ax - bx) * 0.05
-    return f"M{ax:.1f} {ay:.1f} C{ax:.1f} {low:.1f} {bx:.1f} {low:.1f} {bx:.1f} {by + 2:.1f}"
+def _around(source: _Box, target: _Box, right: float, below: float, left: float) -> str:
+    """Return a way back: out of the right of one box, ``below`` all, into the left of another."""
+    turns = [(right, source.y), (right, below), (left, below), (left, target.y)]
+    at = (source.x + source.width / 2, source.y)
+    end = (target.x - (target.width / 2 + 2), target.y)
+    path = f"M{at[0]:.1f} {at[1]:.1f}"
+    for (x, y), after in zip(turns, [*turns[1:], end], strict=True):
+        before, behind = _towards((x, y), at), _towards((x, y), after)
+        path += f" L{before} Q{x:.1f} {y:.1f} {behind}"
+        at = (x, y)
+    return f"{path} L{end[0]:.1f} {end[1]:.1f}"
+
+
+def _towards(corner: tuple[float, float], other: tuple[float, float]) -> str:
+    """Return the point near a corner where its rounding begins, on the way from another."""
+    size = min(hypot(other[0] - corner[0], other[1] - corner[1]) / 2, _CORNER)
+    angle = atan2(other[1] - corner[1], other[0] - corner[0])
+    return f"{corner[0] + size * cos(angle):.1f} {corner[1] + size * sin(angle):.1f}"
 
 
 def _straight(source: _Box, target: _Box, edge: _Edge) -> str:

@@ -15,13 +15,20 @@ if TYPE_CHECKING:
     from rsltrace.trace.words.entities import EntityKey
 
 
+_COLUMN_MAX = 60
+
+
 def table(rows: Iterable[Sequence[str]], *, right: frozenset[int] = frozenset()) -> list[str]:
     """Return ``rows`` as lines with aligned columns, two spaces between them.
 
-    ``right`` has the columns that are aligned to the right. No line ends in spaces.
+    ``right`` has the columns that are aligned to the right. No line ends in spaces. A cell that is
+    very long pushes the rest of its line to the right, not that of all lines.
     """
     cells = [list(row) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    widths = [
+        max((len(cell) for cell in column if len(cell) <= _COLUMN_MAX), default=0)
+        for column in zip(*cells, strict=True)
+    ]
     lines = []
     for row in cells:
         padded = [
@@ -104,9 +111,10 @@ def notes_on(trace: Trace) -> Iterator[str]:
     """Yield what whoever reads results from a trace must know: how far a truncated one goes."""
     if not trace.complete:
         end = seconds_text(trace.end_ns - trace.start_ns)
+        has = f"only the first {trace.event_count} events, to {end} s"
         yield (
-            f"{trace.name} is truncated (its run was killed, or still runs): it has only the first "
-            f"{trace.event_count} events, to {end} s"
+            f"{trace.name} is truncated (its run was killed, or still runs): it has "
+            f"{has if trace.event_count else 'no events'}"
         )
 
 

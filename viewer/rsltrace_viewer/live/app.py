@@ -101,7 +101,7 @@ class LiveApp(ViewerApp):
         """What was executed says where it is."""
 
     def _mode(self) -> str:
-        return "live: executing"
+        return "live"
 
     # Executing.
 

@@ -136,7 +136,7 @@ class Execution:
         event = place.index if place.is_next else place.index - 1
         why = {
             "end": "the end of the run",
-            "begin": "the begin of the run",
+            "begin": "the start of the run",
             "paused": "stopped",
             "diverged": stopped.text or "the run diverged",
         }.get(stopped.reason, stopped.reason)

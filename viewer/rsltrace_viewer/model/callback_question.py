@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
+from dataclasses import replace
 
 from rsltrace.errors import TraceError
 from rsltrace.fast_dataclass import dataclass
@@ -19,13 +20,15 @@ from rsltrace_viewer.model.run import Run
 @dataclass(frozen=True, slots=True)
 class CallbackQuestion:
     """Why a callback of ``node`` did not run in ``run`` (run b: ``other``), or ran late: ``what``
-    names it, ``at_ns`` is the time asked about (None: the whole run)."""
+    names it, ``at_ns`` is the time asked about (None: the whole run). If nothing is wrong until
+    then, it is asked about ``ran_ns``, when the callback ran."""
 
     run: Run
     other: bool
     node: str
     what: str
     at_ns: int | None = None
+    ran_ns: int | None = None
 
     @property
     def command(self) -> str:
@@ -35,14 +38,17 @@ class CallbackQuestion:
             at = f" --at {seconds_text(self.at_ns - self.run.start_ns)}"
         return printable(" ".join(("rsltrace why", path_word(self.run.trace.name), *names)) + at)
 
-    def answers(self) -> Iterator[tuple[list[str], int | None]]:
-        """Yield the lines of the answer, and the event to look at."""
+    def answers(self) -> Iterator[tuple[str, list[str], int | None]]:
+        """Yield the command that answers, the lines of the answer, and the event to look at."""
         try:
             reason = why(self.run.trace, self.node, self.what, self.at_ns)
         except TraceError as error:
-            yield [printable(str(error))], None
+            yield self.command, [printable(str(error))], None
             return
-        yield [*answer_lines(reason)], reason.event
+        if self.ran_ns is not None and not reason.is_reason:
+            yield from replace(self, at_ns=self.ran_ns, ran_ns=None).answers()
+        else:
+            yield self.command, [*answer_lines(reason)], reason.event
 
 
 def question_about(
@@ -61,4 +67,7 @@ def question_about(
         at_ns -= 1  # what was before this call
     elif event.kind is not EventKind.RESUME and 0 <= event.cause_event < index:
         at_ns = run.stamp(event.cause_event)  # when what it received was sent
-    return CallbackQuestion(run, other, node, str(entity.id), at_ns)
+    same = [e for e in run.entities.values() if (e.node, e.name) == (entity.node, entity.name)]
+    alone = sum(one.kind in WITH_CALLBACK for one in same) == 1
+    name = entity.name if alone else str(entity.id)
+    return CallbackQuestion(run, other, node, name, at_ns, event.stamp_ns)

@@ -116,7 +116,8 @@ def _sections(found: Sequence[OverviewSection]) -> Iterator[tuple[str, ...]]:
             else ""
             for of in (one.waited, one.took)
         ]
-        yield (one.name, one.kind, one.node, f"{one.count:,}", rate, f"{one.share:.1%}", *times)
+        of = ("", "") if one.name == one.node else (one.kind, one.node)
+        yield (one.name, *of, f"{one.count:,}", rate, f"{one.share:.1%}", *times)
 
 
 def _logs(run: Run, logs: Logs) -> Iterator[tuple[str, ...]]:

@@ -123,8 +123,8 @@ class ViewerApp(Stepping):
                 self.go(self.session.place_at_time(time), centre=True)
             else:
                 name, index = parse_index(event.text)
-                run = self.session.runs.get(name) or next(iter(self.session.shown.values()))
-                self._go_to_event(min(index, run.count - 1), other=run is self.session.b)
+                run = self.session.run_named(name)
+                self._go_to_event(index, other=run is self.session.b)
 
     def _filter(self, text: str) -> None:
         rows = self.session.set_filter(text)
@@ -370,12 +370,12 @@ class ViewerApp(Stepping):
             if event is not None:
                 self._go_to_event(event, other=question.other)
 
-        def arrive(found: tuple[list[str], int | None] | None, done: bool) -> None:
+        def arrive(found: tuple[str, list[str], int | None] | None, done: bool) -> None:
             if found is not None:
                 self._say("")
-                lines, event = found
+                command, lines, event = found
                 text = Content.styled(lines[0], "bold") + Content("\n" + "\n".join(lines[1:]))
-                self.push_screen(TextScreen(question.command, text, event), gone)
+                self.push_screen(TextScreen(command, text, event), gone)
 
         self._say("looking for the reason … Esc stops")
         walk(self, "seek", question.answers(), arrive, at_once_s=0)

@@ -17,7 +17,7 @@ from textual.content import Content
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
-from rsltrace.job.values.times import parse_time_in_run
+from rsltrace.job.values.times import format_time, parse_time_in_run
 from rsltrace_viewer.model.folder import Found
 from rsltrace_viewer.model.query.parser import completions
 from rsltrace_viewer.model.view import cells, fit
@@ -62,7 +62,7 @@ def question_of(kind: str, session: Session) -> Question:
             "",
             _check_time(session),
         ),
-        "index": Question("index", "go to event", _numbers(session), "", parse_index),
+        "index": Question("index", "go to event", _numbers(session), "", _check_index(session)),
     }
     return questions[kind]
 
@@ -71,8 +71,25 @@ def _check_time(session: Session) -> Callable[[str], object]:
     """Return a function that raises ValueError for what is no time of the runs."""
 
     def check(text: str) -> None:
-        for run in session.shown.values():
-            parse_time_in_run(text).stamp_ns(run.base_ns, run.end_ns)
+        time = parse_time_in_run(text)
+        runs = list(session.shown.values())
+        stamps = [time.stamp_ns(run.base_ns, run.end_ns) for run in runs]
+        if all(stamp > run.trace.end_ns for stamp, run in zip(stamps, runs, strict=True)):
+            last = max(runs, key=lambda run: run.trace.end_ns)
+            since_ns = 0 if time.is_absolute else last.base_ns
+            end = format_time(last.trace.end_ns - since_ns)
+            raise ValueError(f"the run ends at {'@' if time.is_absolute else ''}{end}")
+
+    return check
+
+
+def _check_index(session: Session) -> Callable[[str], object]:
+    """Return a function that raises ValueError for what is no number of an event of the runs."""
+
+    def check(text: str) -> None:
+        name, index = parse_index(text)
+        if index >= session.run_named(name).count:
+            raise ValueError(f"no event {index} (events: {_numbers(session)})")
 
     return check
 
@@ -81,7 +98,8 @@ def _numbers(session: Session) -> str:
     """Return which events there are: ``0 to 99``, of two runs ``a 0 to 99, b 0 to 98``."""
     shown = session.shown.items()
     return ", ".join(
-        f"{name + ' ' if len(shown) > 1 else ''}0 to {max(run.count - 1, 0)}" for name, run in shown
+        f"{name + ' ' if len(shown) > 1 else ''}{f'0 to {run.count - 1}' if run.count else 'none'}"
+        for name, run in shown
     )
 
 

@@ -130,7 +130,7 @@ LIVE_KEYS: tuple[Key, ...] = (
         ". , run",
         1,
     ),
-    Key("comma", ",", "run(-1)", "run back to the last breakpoint, or to the begin", RUN),
+    Key("comma", ",", "run(-1)", "run back to the last breakpoint, or to the start", RUN),
     Key("B", "B", "ask('breakpoint')", "set a breakpoint", RUN, "break", 1),
     Key("D", "D", "clear", "remove a breakpoint", RUN),
     Key("V", "V", "ask('watch')", "watch an expression in the node", RUN, "watch", 2),
@@ -140,6 +140,14 @@ LIVE_KEYS: tuple[Key, ...] = (
 """What a run takes that goes on; all keys that go to an event execute it."""
 
 _SHOWN = {"next": "↓↑", "cause": "c", "effects": "e"}
+
+
+def key_names() -> set[str]:
+    """Return the names that Textual gives to keys: ``down``, ``slash`` …"""
+    from textual.keys import Keys, _character_to_key
+
+    signs = {_character_to_key(chr(code)) for code in range(ord(" "), 127)}
+    return signs | {str(key.value) for key in Keys}
 
 
 def keys_of(*, two: bool, live: bool) -> list[Key]:

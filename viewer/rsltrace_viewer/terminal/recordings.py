@@ -377,7 +377,12 @@ class RecordingApp(BaseApp):
 
     def first_read(self) -> None:
         if self._start is not None:
-            self.session.go_to_message(*self._start)
+            try:
+                beyond = self.session.go_to_message(*self._start)
+            except TimeError as error:
+                beyond = str(error)
+            if beyond:
+                self.notify(beyond, severity="warning")
         elif not self._moved:
             self.session.go_to_difference()
         self.topics.cursor = self.session.place

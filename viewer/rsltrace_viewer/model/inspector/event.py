@@ -317,7 +317,9 @@ def _cause_lines(run: Run, event: EventRecord, effects: Effects | None) -> Itera
         yield Line(0, "effects", "…", Role.SECTION, "effects")
         return
     if effects.done:
-        text = str(len(effects.found)) if effects.found else f"none up to event {effects.searched}"
+        whole = run.trace.complete and effects.searched == run.count - 1
+        none = "none" if whole else f"none up to event {effects.searched}"
+        text = str(len(effects.found)) if effects.found else none
     else:
         text = f"{len(effects.found)} so far, looking at event {effects.searched} …"
     yield Line(0, "effects", text, Role.SECTION, "effects")

@@ -358,14 +358,14 @@ class RecordingSession:
         later = np.flatnonzero(pairs.a >= place)
         self.row = int(later[0]) if len(later) else pairs.count - 1
 
-    def go_to_message(self, number: int | None, time: TimeInRun = START) -> None:
+    def go_to_message(self, number: int | None, time: TimeInRun = START) -> str:
         """Select a message of the first recording by its number in the order of time, or the first
-        at a time or later; the last, if there is none."""
+        at a time or later; the last, if there is none, which is said then."""
         recording = self.recordings[0]
         stamps = [np.array(topic.stamps, dtype=np.int64) for topic in recording.topics]
         every = np.concatenate([*stamps, np.zeros(0, dtype=np.int64)])
         if not len(every):
-            return
+            return ""
         order = np.argsort(every, kind="stable")
         if number is None:
             number = int(
@@ -377,6 +377,7 @@ class RecordingSession:
         topic = recording.topics[which]
         self.place = self.keys.index((topic.name, topic.type))
         self.row = self.pairs.row_of((found - int(ends[which]) + len(stamps[which]), None)) or 0
+        return "" if number < len(every) else f"only {len(every):,} messages: this is the last"
 
     # Words about all of it.
 

@@ -6,17 +6,14 @@ from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from typing import ClassVar
 
-from textual.app import ComposeResult
 from textual.binding import BindingType
-from textual.containers import VerticalScroll
 from textual.content import Content
-from textual.screen import ModalScreen
-from textual.widgets import Static
 
 from rsltrace_viewer.model.lanes import KIND_LETTERS
 from rsltrace_viewer.model.query.fields import FIELDS
 from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.terminal.keys import Key, keys_of
+from rsltrace_viewer.terminal.screens.text import TextScreen
 
 _KEY_WIDTH = 13
 _COLUMN = 56
@@ -25,26 +22,14 @@ _WIDTH_MAX = 200
 _FRAME = 6
 
 
-class HelpScreen(ModalScreen[None]):
-    """Any of its keys closes it."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [("escape,q,question_mark,enter", "dismiss", "close")]
-    DEFAULT_CSS = """
-    HelpScreen { align: center middle; }
-    HelpScreen > VerticalScroll { width: 100%; height: 100%; max-width: 200; background: $surface;
-                                  border: round $primary; padding: 0 1; }
-    """
+class HelpScreen(TextScreen):
+    BINDINGS: ClassVar[list[BindingType]] = [("question_mark", "dismiss(None)", "close")]
+    DEFAULT_CSS = "HelpScreen > VerticalScroll { max-width: 200; }"
 
     def __init__(self, *, two: bool, live: bool = False) -> None:
-        super().__init__()
+        super().__init__("rsltrace view: keys")
         self._two = two
         self._live = live
-
-    def compose(self) -> ComposeResult:
-        with VerticalScroll() as box:
-            box.border_title = "rsltrace view: keys"
-            box.border_subtitle = "Esc closes, ↓ scrolls"
-            yield Static(self.text())
 
     def text(self) -> Content:
         return help_text(self.app.size.width, two=self._two, live=self._live)

@@ -40,6 +40,9 @@ class TextScreen(ModalScreen[int | None]):
             box.border_subtitle = f"{goes}Esc closes, ↓ scrolls"
             yield Static(self.text())
 
+    def on_resize(self) -> None:
+        self.query_one(Static).update(self.text())
+
     def text(self) -> Content:
         return self._text or Content()
 

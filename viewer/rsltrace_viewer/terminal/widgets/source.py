@@ -22,7 +22,7 @@ class SourceView(VerticalScroll, can_focus=True):
                  border-title-color: $text-muted; border-subtitle-color: $text-warning; }
     SourceView:focus { border-top: heavy $primary; }
     SourceView Static { width: auto; }
-    SourceView #note { color: $text-warning; }
+    SourceView #note { width: 100%; color: $text-warning; }
     """
 
     def __init__(self, *, id: str) -> None:  # Textual's name for it
