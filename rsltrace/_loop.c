@@ -46,12 +46,6 @@ static PyMemberDef link_fields[] = {
 
 /* -- links --------------------------------------------------------------------------------------- */
 
-/* Whether a built-in method is the given one of a link. */
-static int is_method(PyObject *method, PyObject *link, PyCFunction function) {
-  return PyCFunction_Check(method) && PyCFunction_GetFunction(method) == function &&
-         PyCFunction_GetSelf(method) == link;
-}
-
 /* Returns the receiver if it is ready now, else None. */
 static PyObject *link_arrive(Link *self, PyObject *release) {
   PyObject *to, *receiver = NULL;
@@ -66,7 +60,7 @@ static PyObject *link_arrive(Link *self, PyObject *release) {
 }
 
 /* What sending reads, held, as any code of Python may replace it. */
-enum { LOOP, ENTITY_ID, RECORDER, SAMPLER, ARRIVE, PLACES, HEAP, HELD };
+enum { ENTITY_ID, RECORDER, SAMPLER, ARRIVE, PLACES, HEAP, HELD };
 
 static int hold(Link *self, PyObject **held, uint64_t *leaves_ns) {
   uint64_t now_ns, busy_ns;
@@ -86,7 +80,6 @@ static int hold(Link *self, PyObject **held, uint64_t *leaves_ns) {
   }
   *leaves_ns = now_ns + busy_ns;
   PyObject *all[HELD] = {
-      [LOOP] = self->loop,
       [ENTITY_ID] = to->entity_id,
       [RECORDER] = dispatcher->recorder,
       [SAMPLER] = self->delay,
@@ -121,34 +114,6 @@ static PyObject *release_of(PyObject *const *held, PyObject *arrival_ns,
   return release;
 }
 
-/* Whether a message without a delay has to wait in the loop's queue. */
-static int is_later(Link *self, PyObject *const *held, uint64_t arrival_ns) {
-  PyObject *expects;
-  uint64_t now_ns;
-  int is_it;
-  if (!HAS_FIELDS(held[LOOP], WholeLoop, loop) ||
-      read_number(((Loop *)held[LOOP])->now_ns, &now_ns) < 0)
-    return -1;
-  if (arrival_ns != now_ns) return 1;
-  expects = PyObject_CallMethod((PyObject *)self, "expects", "O", held[ARRIVE]);
-  is_it = expects == NULL ? -1 : PyObject_IsTrue(expects);
-  Py_XDECREF(expects);
-  return is_it;
-}
-
-static int enter(Link *self, PyObject *const *held, PyObject *release, int later) {
-  PyObject *receiver;
-  int failed;
-  if (later) return later < 0 ? -1 : done(call_two(heappush, held[HEAP], release));
-  receiver = link_arrive(self, release);
-  if (receiver == NULL) return -1;
-  failed = receiver != Py_None &&
-           (!HAS_FIELDS(held[LOOP], WholeLoop, loop) ||
-            append_to(((Loop *)held[LOOP])->ready, receiver) < 0);
-  Py_DECREF(receiver);
-  return failed ? -1 : 0;
-}
-
 static int send_plainly(Link *self, PyObject *const *message) {
   PyObject *held[HELD], *number = NULL, *release = NULL;
   uint64_t leaves_ns, delay_ns, arrival_ns, last_ns;
@@ -165,8 +130,9 @@ static int send_plainly(Link *self, PyObject *const *message) {
               record_draw(held[RECORDER], held[ENTITY_ID], DELAY | delay_ns) < 0);
   }
   if (!failed) release = release_of(held, number, message);
-  failed = release == NULL ||
-           enter(self, held, release, delay_ns ? 1 : is_later(self, held, arrival_ns)) < 0;
+  failed = release == NULL || /* what takes no time is rare, and left to Python */
+           done(delay_ns ? call_two(heappush, held[HEAP], release)
+                         : PyObject_CallMethod((PyObject *)self, "enter", "(O)", release)) < 0;
   Py_XDECREF(release);
   Py_XDECREF(number);
   for (int i = 0; i < HELD; ++i) Py_DECREF(held[i]);
@@ -178,15 +144,11 @@ static PyObject *link_send(Link *self, PyObject *const *args, Py_ssize_t count) 
   Py_RETURN_NONE;
 }
 
-#define LINK_SEND ((PyCFunction)(void (*)(void))link_send)
-
 int send_over(PyObject *link, PyObject *const *message) {
   PyObject *send;
   int result;
-  if (is_a(link, link_type, &link_seen)) {
-    send = ((Link *)link)->send;
-    if (send != NULL && is_method(send, link, LINK_SEND)) return send_plainly((Link *)link, message);
-  }
+  if (is_a(link, link_type, &link_seen) && ((Link *)link)->delay != NULL)
+    return send_plainly((Link *)link, message);
   send = PyObject_GetAttr(link, send_name);
   if (send == NULL) return -1;
   result = done(PyObject_CallFunctionObjArgs(send, message[0], message[1], message[2], message[3],
@@ -196,7 +158,7 @@ int send_over(PyObject *link, PyObject *const *message) {
 }
 
 static PyMethodDef link_methods[] = {
-    {"send_delayed", LINK_SEND, METH_FASTCALL, NULL},
+    {"send_delayed", (PyCFunction)(void (*)(void))link_send, METH_FASTCALL, NULL},
     {"arrive_delayed", (PyCFunction)link_arrive, METH_O, NULL},
     {NULL, NULL, 0, NULL},
 };

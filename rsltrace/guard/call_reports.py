@@ -340,10 +340,9 @@ _is_hooked = False
 
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     """Take an audit event: of hundreds of kinds, few matter."""
-    handle = _HANDLERS.get(event)
-    guard = engaged() if handle is not None else None
-    if handle is None or guard is None:
+    if event not in _HANDLERS or (guard := engaged()) is None:
         return
+    handle = _HANDLERS[event]
     frame: Any = caller()
     if event in _ADDRESSES:
         shows = code_of(frame).co_name in _SHOWING or was_passed(event.partition(".")[2], frame)

@@ -47,6 +47,9 @@ class FastLink(Protocol):
     def expects(self, arrive: Callable[[Release], object]) -> bool:
         """Whether a message is due now that has not arrived yet."""
 
+    def enter(self, release: Release) -> None:
+        """Let a message arrive that takes no time, after those that are due before it."""
+
 
 def fast_send(dispatcher: Dispatcher, link: FastLink, delay: Sampler) -> Send:
     """Return how ``link`` sends if it only delays and keeps the order."""
@@ -87,10 +90,10 @@ def fast_send(dispatcher: Dispatcher, link: FastLink, delay: Sampler) -> Send:
         release = (
             arrival_ns, ORDER_RELEASE, place, arrive, data, event, position, digest, stamp_ns, count
         )  # fmt: skip
-        if delay_ns or arrival_ns != loop.now_ns or link.expects(arrive):
+        if delay_ns:
             heappush(scheduled, release)
-        elif arrive(release) is not None:
-            loop.ready.append(subscription)
+        else:
+            link.enter(release)
 
     return send
 
@@ -317,6 +320,14 @@ class PublisherLink(LinkFields):
             self._arrive((now_ns, ORDER_RELEASE, 0, self._arrive, *message))
         else:
             loop.schedule_release(arrival_ns, self._arrive, *message)
+
+    def enter(self, release: Release) -> None:
+        """Let a message arrive that takes no time: now, unless others are due before it."""
+        loop, arrive = self._loop, release[3]
+        if release[0] != loop.now_ns or self.expects(arrive):
+            heappush(loop.scheduled, release)
+        elif arrive(release) is not None:
+            loop.ready.append(self.subscription)
 
     def expects(self, arrive: Callable[[Release], Any]) -> bool:
         """Whether a due message has not arrived yet: none must overtake it."""

@@ -74,11 +74,14 @@ def messages_chunk(headers: bytes, parts: tuple[bytes, ...]) -> ChunkBody:
     entries[:, 0] = times = messages["log_time"]
     entries[1:, 1] = ends[:-1]
     channels = messages["channel_id"]
-    indexes = []
-    for channel_id in np.bincount(channels).nonzero()[0].tolist():  # np.unique loads numpy.ma
-        chosen = entries[channels == channel_id]
-        record = _index_record(channel_id, chosen.tobytes())
-        indexes.append((channel_id, len(chosen), record))
+    # Sorted at once: in a large graph, a pass over all messages for each channel would take longer
+    # than all else here.
+    by_channel = entries[np.argsort(channels, kind="stable")].tobytes()
+    indexes, end = [], 0
+    for channel_id, count in enumerate(np.bincount(channels).tolist()):
+        if count:
+            start, end = end, end + count * entries[0].nbytes
+            indexes.append((channel_id, count, _index_record(channel_id, by_channel[start:end])))
     return ChunkBody(parts, int(times.min()), int(times.max()), tuple(indexes))
 
 

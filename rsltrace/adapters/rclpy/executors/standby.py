@@ -23,6 +23,7 @@ from rsltrace.adapters.rclpy.concurrency.callback_groups import is_busy, is_cust
 from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox
 from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
+from rsltrace.guard.frames import code_of
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
 from rsltrace.simulation.middleware.events.event import OutsideEvent
@@ -221,16 +222,16 @@ def standby_of(
         return None
     own = _rclpy_code()
     frame: FrameType | None = sys._getframe(3)
-    if frame is None or frame.f_code is not own.one_turn:
+    if frame is None or code_of(frame) is not own.one_turn:
         return None
     future = None
     if condition is not own.never:
         future = getattr(condition, "__self__", None)
         if future is None or getattr(condition, "__func__", None) is not own.done:
             return None
-    while frame is not None and frame.f_code in own.turns:
+    while frame is not None and code_of(frame) in own.turns:
         frame = frame.f_back
-    is_endless = not has_limit and frame is not None and frame.f_code in own.spins
+    is_endless = not has_limit and frame is not None and code_of(frame) in own.spins
     return Standby(runtime, driver, future, once=not is_endless)
 
 

@@ -19,6 +19,7 @@ from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
 from rsltrace.adapters.rclpy.handles.entity_handle import EVENTS, Alarm
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.guard.frames import code_of
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.trace.model.event import NO_EVENT, EventKind
 
@@ -308,7 +309,7 @@ def sync_woken(nodes: Collection[Any], caller: FrameType) -> None:
     A node wakes its executor after each change: then only that node is checked, so that a thousand
     nodes are not checked nine thousand times.
     """
-    if caller.f_code.co_name == "_wake_executor" and (woken := caller.f_locals["self"]) in nodes:
+    if code_of(caller).co_name == "_wake_executor" and (woken := caller.f_locals["self"]) in nodes:
         nodes = [woken]
     for node in nodes:
         sync_waitables(node.handle)
