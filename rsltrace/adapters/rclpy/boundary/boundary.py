@@ -154,7 +154,6 @@ class RclpyBoundary:
         for name in _TYPES:
             if hasattr(real or extension, name):
                 setattr(self, name, getattr(real or extension, name))
-        self._signals = self.SignalHandlerOptions.NO
         set_invalid_handle(self.InvalidHandle)
         self.Destroyable = Destroyable
         self.Clock = type("Clock", (ClockHandle,), {"boundary": self})
@@ -491,16 +490,19 @@ class RclpyBoundary:
         if self._world is not None:
             self._world.logs.log(severity, name, message, function, file, line)
 
-    # -- signals: rsltrace's own handlers end a run properly ---------------------------------------
+    # -- signals: rsltrace's own handlers act for those that a process has installed ---------------
 
     def install_signal_handlers(self, options: Any) -> None:
-        self._signals = options
+        if self.get_current_signal_handlers_options() == self.SignalHandlerOptions.NO:
+            self.runtime.programs.present.signals = options
 
     def uninstall_signal_handlers(self) -> None:
-        self._signals = self.SignalHandlerOptions.NO
+        if self._world is not None:
+            self.runtime.programs.present.signals = None
 
     def get_current_signal_handlers_options(self) -> Any:
-        return self._signals
+        signals = None if self._world is None else self.runtime.programs.present.signals
+        return signals or self.SignalHandlerOptions.NO
 
     def register_sigint_guard_condition(self, guard: Any) -> None:
         pass
