@@ -131,6 +131,15 @@ def test_a_simulator_drives_the_time_of_others(record_job: Callable[..., Any]) -
         assert logs(plain.path) == ["begins at 0.0", "second at 1.0"]
 
 
+def test_a_simulator_whose_time_nobody_follows_is_noted(record_job: Callable[..., Any]) -> None:
+    nodes = "nodes: [{node: nodes_under_test:Simulator}, {node: nodes_under_test:Robot}]\n"
+    for more, times in (("", 1), ("clocks: {source: topic}\n", 0), ("clocks: []\n", 1)):
+        result = record_job(f"{nodes}{more}stop: {{duration: 500ms}}\n", CODE, output="noted.mcap")
+        assert len([note for note in result.notes if "clocks: {source: topic}" in note]) == times
+    result = record_job(nodes.replace("Robot", "Simulator, name: other"), CODE, output="two.mcap")
+    assert not any("clocks" in note for note in result.notes)
+
+
 def test_a_main_goes_by_it_too(record_job: Callable[..., Any]) -> None:
     result = record_job("nodes: [{main: nodes_under_test:main}]\nclocks: {source: topic}\n", CODE)
     assert logs(result.path) == JUST

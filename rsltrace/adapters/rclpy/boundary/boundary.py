@@ -201,6 +201,18 @@ class RclpyBoundary:
         world = self._world
         return world is not None and world.clocks is not None and world.clocks.follows(owner)
 
+    def note_ignored_time(self) -> None:
+        """Note that a node publishes /clock and others would follow it, if the job does not say
+        who: a bag's times are the run's own."""
+        world = self._world
+        if world is None or world.clocks is not None:
+            return
+        notes, graph = self.runtime.domain.outcome.notes, self.runtime.domain.graph
+        if _IGNORED_TIME not in notes and any(
+            p.node is not None for p in graph.publishers("/clock")
+        ):
+            notes.append(_IGNORED_TIME)
+
     def look_ns(self, owner: str | None) -> int:
         """Return what a node's ROS clock shows to user code; reading may advance it."""
         world = self._world
@@ -533,6 +545,10 @@ HANDLES: dict[str, type] = {
 """The classes of the objects that the boundary makes, by their names in rclpy's extension."""
 
 _PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
+_IGNORED_TIME = (
+    "a node publishes /clock, but nodes with use_sim_time show the run's own time: write clocks: "
+    "{source: topic} into the job to make them follow"
+)
 
 
 def _service_types(ends: Iterable[ServiceEndpoint]) -> list[tuple[str, list[str]]]:
