@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from rsltrace.adapters.player import BagPublisher
 from rsltrace.adapters.rclpy.arguments import (
     InvalidArgumentsError,
     RosArguments,
@@ -202,15 +203,15 @@ class RclpyBoundary:
         return world is not None and world.clocks is not None and world.clocks.follows(owner)
 
     def note_ignored_time(self) -> None:
-        """Note that a node publishes /clock and others would follow it, if the job does not say
-        who: a bag's times are the run's own."""
+        """Note that nobody follows a node's /clock, if the job does not say who does. (The times of
+        a bag are the run's own.)"""
         world = self._world
         if world is None or world.clocks is not None:
             return
-        notes, graph = self.runtime.domain.outcome.notes, self.runtime.domain.graph
-        if _IGNORED_TIME not in notes and any(
-            p.node is not None for p in graph.publishers("/clock")
-        ):
+        notes = self.runtime.domain.outcome.notes
+        publishers = self.runtime.domain.graph.publishers("/clock")
+        from_node = any(not isinstance(one, BagPublisher) for one in publishers)
+        if from_node and _IGNORED_TIME not in notes:
             notes.append(_IGNORED_TIME)
 
     def look_ns(self, owner: str | None) -> int:
