@@ -12,7 +12,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rsltrace.adapters.player import BagPublisher
 from rsltrace.adapters.rclpy.arguments import (
     InvalidArgumentsError,
     RosArguments,
@@ -203,15 +202,13 @@ class RclpyBoundary:
         return world is not None and world.clocks is not None and world.clocks.follows(owner)
 
     def note_ignored_time(self) -> None:
-        """Note that nobody follows a node's /clock, if the job does not say who does. (The times of
-        a bag are the run's own.)"""
+        """Note that nobody follows the /clock of a node, if the job does not say who does. (If bags
+        play, their times are the run's own.)"""
         world = self._world
-        if world is None or world.clocks is not None:
+        if world is None or world.clocks is not None or self.runtime.programs.fed:
             return
-        notes = self.runtime.domain.outcome.notes
-        publishers = self.runtime.domain.graph.publishers("/clock")
-        from_node = any(not isinstance(one, BagPublisher) for one in publishers)
-        if from_node and _IGNORED_TIME not in notes:
+        notes, graph = self.runtime.domain.outcome.notes, self.runtime.domain.graph
+        if graph.publishers("/clock") and _IGNORED_TIME not in notes:
             notes.append(_IGNORED_TIME)
 
     def look_ns(self, owner: str | None) -> int:
