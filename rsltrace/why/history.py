@@ -206,6 +206,18 @@ class RunHistory:
         made = (one for one in mains if event in (self.made_by(one), *self.runs_of(one)))
         return next(made, 0)
 
+    def _spins(self, wait: Occupation, node: int) -> bool:
+        """Return whether callbacks of a node began while a main waited: it spun the node."""
+        own = [
+            one.id
+            for one in self.trace.entities.values()
+            if one.node == node and one.kind is not EntityKind.THREAD
+        ]
+        during = self.events[wait.event + 1 : self.ended]
+        during = during[during["stamp"] < wait.to_ns]
+        began = (during["kind"] != EventKind.RESUME) & (during["kind"] != EventKind.CONSTRUCT)
+        return bool(np.isin(during["entity"][began], own).any())
+
     def occupations_of(
         self, entity: Entity, from_ns: int, to_ns: int, shares: Callable[[Entity], bool]
     ) -> list[Occupation]:
@@ -218,7 +230,7 @@ class RunHistory:
             if shared_ns > 0:
                 other = self.trace.entity(one.entity)
                 if other.kind is EntityKind.MAIN:
-                    blocks = other.id == main
+                    blocks = other.id == main and not self._spins(one, entity.node)
                 elif other.node != entity.node:
                     blocks = one.verb == "ran" and shares(other)
                 else:

@@ -230,6 +230,23 @@ def test_awaiting_a_client_of_the_same_group_is_explained(simulate: Any) -> None
         simulate(Server, Own)
 
 
+def test_awaiting_a_server_of_the_same_group_is_explained(simulate: Any) -> None:
+    class Own(Node):
+        def __init__(self) -> None:
+            super().__init__("own")
+            own = ReentrantCallbackGroup()
+            self.client = self.create_client(Trigger, "ask", callback_group=own)
+            self.create_service(Trigger, "ask", lambda request, response: response)
+            self.timer = self.create_timer(1.0, self.tick)
+
+        async def tick(self) -> None:
+            self.timer.cancel()
+            await self.client.call_async(Trigger.Request())
+
+    with pytest.raises(DeadlockError, match="request has arrived, but its server shares"):
+        simulate(Own)
+
+
 def test_a_server_that_returns_nothing_ends_the_run_with_its_name(simulate: Any) -> None:
     class Forgetful(Node):
         def __init__(self) -> None:

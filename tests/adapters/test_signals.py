@@ -5,11 +5,20 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import (
+    SignalHandlerOptions,
+    get_current_signal_handlers_options,
+    install_signal_handlers,
+    uninstall_signal_handlers,
+)
+from std_msgs.msg import UInt64
 
 from rsltrace import NodeSpec
 
@@ -170,6 +179,58 @@ def test_sigterm_from_a_main_for_itself_shuts_rclpy_down(simulate: Any) -> None:
     assert seen == ["went on", False]  # spin returns: the context is no longer valid
     assert recorded.result.end_ns == 3_000_000_000
     assert recorded.result.exit_code == 0
+
+
+@pytest.mark.parametrize("own", ["NO", "SIGTERM", "context"])
+def test_without_the_handler_of_rclpy_an_interrupted_main_may_still_publish(
+    simulate: Any, own: str
+) -> None:
+    seen: list[Any] = []
+
+    def interrupted(number: int, send: Callable[[], None]) -> NodeSpec:
+        def main() -> None:
+            context = rclpy.Context()
+            if own == "context":
+                rclpy.init(context=context)  # which installs no handlers
+            else:
+                rclpy.init(
+                    context=context, signal_handler_options=getattr(SignalHandlerOptions, own)
+                )
+            node = Node("node", context=context)
+            publisher = node.create_publisher(UInt64, "last", 10)
+            node.create_timer(0.5 + number, send)
+            executor = SingleThreadedExecutor(context=context)
+            executor.add_node(node)
+            try:
+                executor.spin()
+            except KeyboardInterrupt:
+                publisher.publish(UInt64(data=7))
+                seen.append(context.ok())
+
+        return NodeSpec(main=main)
+
+    both = (lambda: signal.raise_signal(signal.SIGINT)), (lambda: None)  # itself; by the end
+    recorded = simulate(*(interrupted(n, send) for n, send in enumerate(both)), Other, duration=3)
+    assert seen == [True, True]
+    assert recorded.result.exit_code == 0
+
+
+def test_handlers_are_installed_once_in_each_main(simulate: Any) -> None:
+    seen: list[tuple[str, str]] = []
+
+    def installs(name: str, *options: str) -> NodeSpec:
+        def main() -> None:
+            for option in options:
+                install_signal_handlers(getattr(SignalHandlerOptions, option))
+                seen.append((name, get_current_signal_handlers_options().name))
+            uninstall_signal_handlers()
+            seen.append((name, get_current_signal_handlers_options().name))
+
+        return NodeSpec(main=main)
+
+    simulate(installs("a", "NO", "SIGINT", "ALL", "NO"), installs("b", "SIGTERM"), duration=1)
+    told = ["NO", "SIGINT", "SIGINT", "SIGINT", "NO"]  # as natively
+    assert seen == [*(("a", one) for one in told), ("b", "SIGTERM"), ("b", "NO")]
 
 
 def test_sigterm_ends_a_main_without_rclpy(simulate: Any) -> None:

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.ros
 NODES = """
 import os
 import time
+import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -48,6 +49,26 @@ class Sink(Node):
 
     def heard(self, message):
         self.out.publish(message)
+
+def main():
+    rclpy.init()
+    order = [Sink, Source] if os.environ.get("FIRST") == "sink" else [Source, Sink]
+    executor = rclpy.executors.SingleThreadedExecutor()
+    for node in [make() for make in order]:
+        executor.add_node(node)
+    executor.spin()
+
+class Guarded(Node):
+    def __init__(self):
+        super().__init__("guarded")
+        self.watchdog = self.create_timer(float(os.environ.get("PERIOD", "0.5")), self.expired)
+        self.create_timer(0.2, self.work)
+
+    def work(self):
+        self.watchdog.reset()
+
+    def expired(self):
+        pass
 
 class Busy(Node):
     def __init__(self):
@@ -221,6 +242,27 @@ def test_periods_that_differ_are_shown_so(tmp_path: Path, monkeypatch: pytest.Mo
     b = recorded(tmp_path, "b.mcap", monkeypatch, PERIOD="0.1000001")
     assert "timer period 100 → 100.0001 ms" in rsltrace.diff(a, b).sentence
     assert "timer period 100.0001 → 100 ms" in rsltrace.diff(b, a).sentence
+
+
+def test_the_period_shows_where_a_timer_is_first_reset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = "nodes: [{node: 'changed_nodes:Guarded'}]\nstop: {duration: 1s}\n"
+    a = recorded(tmp_path, "a.mcap", monkeypatch, job)
+    b = recorded(tmp_path, "b.mcap", monkeypatch, job, PERIOD="0.4")
+    assert "timer Guarded.expired: period 500 → 400 ms" in rsltrace.diff(a, b).sentence
+    assert "timer Guarded.expired: period 400 → 500 ms" in rsltrace.diff(b, a).sentence
+
+
+def test_a_main_that_makes_its_nodes_in_another_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = "nodes: [{main: 'changed_nodes:main'}]\nstop: {duration: 1s}\n"
+    a = recorded(tmp_path, "a.mcap", monkeypatch, job)
+    b = recorded(tmp_path, "b.mcap", monkeypatch, job, FIRST="sink")
+    told = "the nodes are constructed in a different order: /source first in a, /sink in b"
+    assert rsltrace.diff(a, b).sentence.lower().startswith(told)
+    assert "first in a, /source in b" in rsltrace.diff(b, a).sentence
 
 
 @pytest.mark.few(1)

@@ -13,6 +13,7 @@ import pytest
 
 import rsltrace
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.recordings.export import export_bag
 
 pytestmark = pytest.mark.ros
 
@@ -129,6 +130,25 @@ def test_a_simulator_drives_the_time_of_others(record_job: Callable[..., Any]) -
     for more in ("", "clocks: [{node: /simulator, source: topic}]\n"):
         plain = record_job(f"{nodes}{more}stop: {{duration: 1.35s}}\n", CODE, output="plain.mcap")
         assert logs(plain.path) == ["begins at 0.0", "second at 1.0"]
+
+
+def test_a_simulator_whose_time_nobody_follows_is_noted(record_job: Callable[..., Any]) -> None:
+    nodes = "nodes: [{node: nodes_under_test:Simulator}, {node: nodes_under_test:Robot}]\n"
+    for more, times in (("", 1), ("clocks: {source: topic}\n", 0), ("clocks: []\n", 1)):
+        result = record_job(f"{nodes}{more}stop: {{duration: 500ms}}\n", CODE, output="noted.mcap")
+        assert len([note for note in result.notes if "clocks: {source: topic}" in note]) == times
+    result = record_job(nodes.replace("Robot", "Simulator, name: other"), CODE, output="two.mcap")
+    assert not any("clocks" in note for note in result.notes)
+
+
+def test_the_clock_of_a_bag_is_that_of_the_run(record_job: Callable[..., Any]) -> None:
+    nodes = "nodes: [{node: nodes_under_test:Simulator}]\nstop: {duration: 500ms}\n"
+    recorded = record_job(nodes, CODE)
+    export_bag(recorded.path, recorded.path.parent / "bag")
+    result = record_job(
+        "nodes: [{node: nodes_under_test:Robot}]\nbags: [bag]\n", CODE, output="played.mcap"
+    )
+    assert not any("clocks" in note for note in result.notes)
 
 
 def test_a_main_goes_by_it_too(record_job: Callable[..., Any]) -> None:

@@ -114,6 +114,34 @@ class Often(Node):
 """
 
 
+WRAPPED = """\
+import functools
+import rclpy
+
+
+class Counted:
+    def __init__(self, function):
+        functools.update_wrapper(self, function)
+        self.function = function
+
+    def __call__(self):
+        return self.function()
+
+
+def tick():
+    raise SystemExit
+
+
+rclpy.init()
+node = rclpy.create_node("node")
+node.create_timer(0.1, Counted(tick))
+try:
+    rclpy.spin(node)
+except SystemExit:
+    pass
+"""
+
+
 def _line(mark: str) -> str:
     lines = PROGRAM.splitlines()
     return f"marked.py:{1 + next(i for i, line in enumerate(lines) if line.endswith(f'# {mark}'))}"
@@ -171,6 +199,26 @@ def test_events_have_the_function_that_ran(trace: Path) -> None:
         (EventKind.TASK, "/fib/_action/send_goal", _line("executes")),
         (EventKind.SERVICE, "/go", _line("serve")),
     } <= met
+
+
+def test_programs_and_wrapped_callbacks_have_the_place_of_what_they_run(tmp_path: Path) -> None:
+    import rsltrace
+
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack/__init__.py").write_text("")
+    (tmp_path / "pack/talk.py").write_text(WRAPPED)
+    (tmp_path / "talk.py").write_text(WRAPPED)
+    (tmp_path / "job.yaml").write_text(
+        "nodes: [{script: talk.py}, {module: pack.talk, name: second}]\nsearch_path: [.]\n"
+    )
+    rsltrace.record(rsltrace.load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap")
+    with Trace.open(tmp_path / "run.mcap") as opened:
+        made = {one.kind.name: [] for one in opened.entities.values()}
+        for one in opened.entities.values():
+            made[one.kind.name].append(one.source)
+    assert made["MAIN"] == ["talk.py:1", "pack/talk.py:1"]
+    line = 1 + WRAPPED.splitlines().index("def tick():")
+    assert made["TIMER"] == [f"talk.py:{line}", f"talk.py:{line}"]
 
 
 def test_what_was_not_looked_at_is_not_told_as_certain(tmp_path: Path) -> None:

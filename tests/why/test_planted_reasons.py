@@ -245,6 +245,46 @@ def test_reason_entity_and_line(
     assert text.stderr.startswith("next: ") == (found["event"] is not None)
 
 
+SPINNING = """
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import UInt64
+
+LAST = QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+class Late(Node):
+    def __init__(self):
+        super().__init__("late")
+        self.out = self.create_publisher(UInt64, "map", LAST)
+        self.count = 0
+        self.create_timer(0.1, self.tick)
+        self.create_timer(0.35, self.join)
+
+    def tick(self):
+        self.count += 1
+        self.out.publish(UInt64(data=self.count))
+
+    def join(self):
+        self.create_subscription(UInt64, "map", lambda message: None, LAST)
+
+def main():
+    rclpy.init()
+    node = Late()
+    rclpy.spin_until_future_complete(node, rclpy.Future(), timeout_sec=1.0)
+"""
+
+
+def test_a_main_that_spins_a_node_does_not_keep_it_waiting(
+    tmp_path: Path, command: Callable[..., subprocess.CompletedProcess[str]]
+) -> None:
+    (tmp_path / "spinning.py").write_text(SPINNING)
+    (tmp_path / "job.yaml").write_text("nodes: [{main: 'spinning:main'}]\n")
+    run(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap")
+    done = command("why", tmp_path / "run.mcap", "/late", "map", "--at", "0.35", "--json")
+    assert json.loads(done.stdout)["reason"] == "as_expected", done.stdout
+
+
 @pytest.mark.parametrize(
     "qos",
     [

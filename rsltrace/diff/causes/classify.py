@@ -90,6 +90,9 @@ class DivergenceCase:
     changed: EntityChanges | None = None
     """The entities whose QoS differs, of the topics that are concerned."""
 
+    reordered: bool = False
+    """Whether a main constructs another one of the nodes of both runs first."""
+
     swapped: bool = False
     """Whether the bag of b plays later what the bag of a plays here, and the other way round."""
 
@@ -201,10 +204,10 @@ def _construction(case: DivergenceCase) -> Judgement:
     what: DivergenceFact
     if a is None or b is None:
         root, what = Root.JOB, DivergenceKind.CONSTRUCTED_IN_ONE
+    elif case.inverted or case.reordered:
+        what = DivergenceKind.CONSTRUCTION_ORDER
     elif a.entity != b.entity:
         what = DivergenceKind.NODE_RENAMED
-    elif case.inverted:
-        what = DivergenceKind.CONSTRUCTION_ORDER
     elif a.stamp_ns != b.stamp_ns and all(map(_is_stamp_of_parameters, case.messages)):
         return _timing(case, a)
     elif case.changed is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rsltrace.diff.alignment.rows import BAG, ComparedTrace, load_rows
+from rsltrace.diff.causes.event_views import entity_detail
 from rsltrace.diff.facts.causes import (
     Loss,
     NoMoreMessages,
@@ -102,20 +103,13 @@ def _sent_between(run: ComparedTrace, view: EventSummary, later: tuple[int, int,
 
 
 def _depth(run: ComparedTrace, number: int) -> int | None:
-    depth = _qos(_detail(run, number)).get("depth")
+    depth = _qos(entity_detail(run, number)).get("depth")
     return depth if isinstance(depth, int) else None
 
 
 def _qos(detail: dict[str, object]) -> dict[str, object]:
     qos = detail.get("qos")
     return qos if isinstance(qos, dict) else {}
-
-
-def _detail(run: ComparedTrace, number: int) -> dict[str, object]:
-    """Return what the trace says of an entity, nothing if the run has it not."""
-    table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
-    ids = (table == number).nonzero()[0]
-    return run.trace.entities[int(ids[0])].detail if len(ids) else {}
 
 
 # -- entities with other properties ---------------------------------------------------------------
@@ -146,7 +140,7 @@ def entity_changes(
     """
     alone = {*run_a.matching.only_a, *run_a.matching.only_b}
     known = {
-        key: (_detail(run_a, number), _detail(run_b, number))
+        key: (entity_detail(run_a, number), entity_detail(run_b, number))
         for number, key in enumerate(run_a.matching.keys)
         if number not in alone and (key.name in topics or key.node in nodes)
     }
@@ -271,7 +265,7 @@ def periods(
     if view is None or view.kind is not EventKind.TIMER:
         return None
     number = run_a.matching.by_key[view.entity]
-    one, other = (_detail(run, number).get("period_ns") for run in (run_a, run_b))
+    one, other = (entity_detail(run, number).get("period_ns") for run in (run_a, run_b))
     if isinstance(one, int) and isinstance(other, int) and one != other:
         return one, other
     return None

@@ -123,3 +123,10 @@ def subject_of(view: EventSummary) -> str:
     """Return the node an event is of, ``main package:main`` for a main without one, or ""."""
     is_main = view.entity.kind == EntityKind.MAIN.label
     return view.node or (f"main {view.entity.name}" if is_main else "")
+
+
+def entity_detail(run: ComparedTrace, number: int) -> dict[str, object]:
+    """Return what the trace says of an entity, nothing if the run has it not."""
+    table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
+    ids = (table == number).nonzero()[0]
+    return run.trace.entities[int(ids[0])].detail if len(ids) else {}

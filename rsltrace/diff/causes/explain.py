@@ -169,8 +169,10 @@ class Explainer:
             self.view(found.place_a, of_b=False),
             self.view(found.place_b, of_b=True),
         )
-        if other_a is not None and other_b is not None and _is_renamed(self, other_a, other_b):
-            return other_a, other_b, ()
+        if other_a is not None and other_b is not None:
+            renamed = _is_renamed(self, other_a, other_b)
+            if renamed or (None in (a, b) and _is_reordered(self, other_a, other_b)):
+                return other_a, other_b, ()
         return a, b, message_differences(self.run_a, self.run_b, a, b, self.options)
 
     def _judge(
@@ -200,6 +202,7 @@ class Explainer:
                 periods_ns=periods(self.run_a, self.run_b, a, b),
                 slept=slept(self.run_a, self.run_b, a, b),
                 changed=self._changed(a or b, messages),
+                reordered=a is not None and b is not None and _is_reordered(self, a, b),
                 swapped=are_swapped(self.run_a, self.run_b, a, b),
             )
         )
@@ -476,6 +479,15 @@ def _is_renamed(explainer: Explainer, a: EventSummary, b: EventSummary) -> bool:
     matching = explainer.run_a.matching
     alone_a = matching.by_key[a.entity] in matching.only_a
     return bool(a.entity.type) and alone_a and matching.by_key[b.entity] in matching.only_b
+
+
+def _is_reordered(explainer: Explainer, a: EventSummary, b: EventSummary) -> bool:
+    """Whether two mains begin with different nodes that both runs have."""
+    if not a.kind is b.kind is EventKind.CONSTRUCT or a.entity == b.entity:
+        return False
+    matching = explainer.run_a.matching
+    alone = {*matching.only_a, *matching.only_b}
+    return not alone & {matching.by_key[one.entity] for one in (a, b)}
 
 
 _SHARED = {

@@ -21,7 +21,7 @@ from rsltrace.diff.alignment.rows import (
     load_rows,
     outputs_of,
 )
-from rsltrace.diff.causes.event_views import drawn_for
+from rsltrace.diff.causes.event_views import drawn_for, entity_detail
 from rsltrace.diff.facts.evidence import (
     EventSummary,
     FieldDifference,
@@ -55,6 +55,7 @@ from rsltrace.trace.model.operation import (
     PARAMETER_EVENTS,
     TIMER_CANCEL,
     TIMER_PERIOD,
+    TIMER_RESET,
     pack_operation,
 )
 from rsltrace.trace.model.texts import contrasting, printable, shortened
@@ -139,10 +140,12 @@ class _MessageComparison:
             places = self._places(self._run_a, x, a) + self._places(self._run_b, y, b)
             found = replace(found, code=tuple(dict.fromkeys(places)))
             one = x or y
-            if one is not None and not (x and y):
+            fate: OutputFate | None = None
+            if x and y:
+                fate = fates.timer_periods(x, y) if x[0] == OutputKind.TIMER else None
+            elif one is not None:
                 fate = fates.fate(one, (outputs_a, outputs_b), only_b=x is None)
-                found = replace(found, fate=fate or found.fate)
-            yield found
+            yield replace(found, fate=fate or found.fate)
 
     def _places(
         self, run: ComparedTrace, row: OutputRow | None, view: EventSummary | None
@@ -344,6 +347,21 @@ class _OutputChanges:
         if late_ns <= 0 or contents != others or (repeats and mine[1:] != theirs[1:]):
             return None  # another one, of a sender that often sends the same
         return SendDelay(late_ns, "a" if only_b else "b")
+
+    def timer_periods(self, a: OutputRow, b: OutputRow) -> TimerPeriod | None:
+        """Return the periods of a timer that both runs set or reset to another deadline."""
+        found = []
+        for run, view, rows, (_, number, content, _) in zip(
+            self._runs, self._views, self._rows, (a, b), strict=True
+        ):
+            assert view is not None
+            known = [entity_detail(run, number).get("period_ns"), *_periods(rows, number)]
+            for period_ns in (one for one in known if isinstance(one, int)):
+                reset = pack_operation(TIMER_RESET, view.stamp_ns + period_ns)
+                if content in (hash64(reset), hash64(pack_operation(TIMER_PERIOD, period_ns))):
+                    found.append(period_ns)
+                    break
+        return TimerPeriod(found[0], found[1]) if len({*found}) == 2 else None
 
     def _done_to_timer(self, row: OutputRow, name: str, *, only_b: bool) -> OutputFate | None:
         _, number, content, _ = row

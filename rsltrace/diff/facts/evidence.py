@@ -225,11 +225,12 @@ class TimerCancellation(Fact):
 
 @dataclass(frozen=True, slots=True)
 class TimerPeriod(Fact):
-    """A timer got another period, in one run; ``before_ns`` is None if the old one is unknown."""
+    """A timer got another period, in one run; ``before_ns`` is None if the old one is unknown.
+    ``run`` is "" if its period is ``before_ns`` in a and ``after_ns`` in b."""
 
     before_ns: int | None
     after_ns: int
-    run: str
+    run: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,6 +133,13 @@ def _(what: DivergenceKind, of: Judgement) -> str:
     return f"the graphs differ: {name} is constructed in {has} but not in {has_not}"
 
 
+@says(DivergenceKind.CONSTRUCTION_ORDER)
+def _(what: DivergenceKind, of: Judgement) -> str:
+    a, b = _both(of)
+    firsts = f": {a.entity.name} first in a, {b.entity.name} in b" if a.entity != b.entity else ""
+    return f"the nodes are constructed in a different order{firsts}"
+
+
 @says(DivergenceKind.NODE_RENAMED)
 def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
@@ -656,9 +663,6 @@ def _(cause: SetOrder, of: object) -> str:
 
 SENTENCES.update(
     {
-        DivergenceKind.CONSTRUCTION_ORDER: lambda fact, of: (
-            "the nodes are constructed in a different order"
-        ),
         DivergenceKind.OTHER_FROM_OUTSIDE: lambda fact, of: f"{_at(_one(of))} is different",
         DivergenceKind.OTHER_DONE_OUTSIDE: lambda fact, of: (
             f"{_at(_one(of))} is different{what_differs(of.messages)}"

@@ -227,7 +227,8 @@ def _(fate: SendCount, of: object) -> str:
 def _(fate: TimerPeriod, of: object) -> str:
     if fate.before_ns is None:
         return f"set to a period of {format_duration(fate.after_ns)} in {fate.run}"
-    return f"period {durations(fate.before_ns, fate.after_ns)} in {fate.run}"
+    where = f" in {fate.run}" if fate.run else ""
+    return f"period {durations(fate.before_ns, fate.after_ns)}{where}"
 
 
 def output_change_text(message: MessageDifference) -> str:

@@ -112,8 +112,8 @@ _identity: Callable[[object], int] = object.__hash__
 """Identifies objects like ``id``, but raises no audit event."""
 
 _SKIPPED_MODULES = frozenset(
-    "_thread threading _io io socket ssl _socket select selectors asyncio multiprocessing "
-    "subprocess concurrent rclpy rsltrace greenlet logging weakref ctypes _ctypes "
+    "_thread _threading_local threading _io io socket ssl _socket select selectors asyncio "
+    "multiprocessing subprocess concurrent rclpy rsltrace greenlet logging weakref ctypes _ctypes "
     "mmap".split()
 )
 

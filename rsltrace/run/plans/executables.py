@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from operator import attrgetter
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 
 from rsltrace.adapters.processes.build import is_compiled, is_python, why_not_run
 from rsltrace.adapters.rclpy.boundary.boundary import NeedsItsProcess, before_its_process
@@ -51,6 +51,11 @@ class MainProgram:
     code: CodeType
     folder: str
     spec: ModuleSpec | None = None
+
+    def __post_init__(self) -> None:
+        """Say what it runs: traces name the program's file then, not this one."""
+        names = {} if self.spec is None else {"__name__": self.spec.name}
+        vars(self)["__wrapped__"] = FunctionType(self.code, names)
 
     def __call__(self) -> None:
         """Run the program as ``__main__``."""

@@ -105,12 +105,21 @@ def callback_code(callback: object) -> tuple[CodeType, Mapping[str, object]] | N
             return (callback.cr_code, frame.f_globals) if frame is not None else None
         elif isinstance(callback, type):
             callback = callback.__init__  # type: ignore[misc]
+        elif (wrapped := _attributes(callback).get("__wrapped__")) is not None:
+            callback = wrapped
         else:
             callbacks = (vars(one).get("__call__") for one in type(callback).__mro__)
             callback = next((one for one in callbacks if one is not None), None)
             if not isinstance(callback, FunctionType):
                 return None
     return None
+
+
+def _attributes(value: object) -> dict[str, object]:
+    try:
+        return object.__getattribute__(value, "__dict__")  # type: ignore[no-any-return]
+    except AttributeError:
+        return {}
 
 
 def imported_file(code: CodeType, names: Mapping[str, object]) -> str:

@@ -154,7 +154,6 @@ class RclpyBoundary:
         for name in _TYPES:
             if hasattr(real or extension, name):
                 setattr(self, name, getattr(real or extension, name))
-        self._signals = self.SignalHandlerOptions.NO
         set_invalid_handle(self.InvalidHandle)
         self.Destroyable = Destroyable
         self.Clock = type("Clock", (ClockHandle,), {"boundary": self})
@@ -201,6 +200,16 @@ class RclpyBoundary:
         """Return whether /clock drives the ROS time of a node."""
         world = self._world
         return world is not None and world.clocks is not None and world.clocks.follows(owner)
+
+    def note_ignored_time(self) -> None:
+        """Note that nobody follows the /clock of a node, if the job does not say who does. (If bags
+        play, their times are the run's own.)"""
+        world = self._world
+        if world is None or world.clocks is not None or self.runtime.programs.fed:
+            return
+        notes, graph = self.runtime.domain.outcome.notes, self.runtime.domain.graph
+        if graph.publishers("/clock") and _IGNORED_TIME not in notes:
+            notes.append(_IGNORED_TIME)
 
     def look_ns(self, owner: str | None) -> int:
         """Return what a node's ROS clock shows to user code; reading may advance it."""
@@ -491,16 +500,19 @@ class RclpyBoundary:
         if self._world is not None:
             self._world.logs.log(severity, name, message, function, file, line)
 
-    # -- signals: rsltrace's own handlers end a run properly ---------------------------------------
+    # -- signals: rsltrace's own handlers act for those that a process has installed ---------------
 
     def install_signal_handlers(self, options: Any) -> None:
-        self._signals = options
+        if self.get_current_signal_handlers_options() == self.SignalHandlerOptions.NO:
+            self.runtime.programs.present.signals = options
 
     def uninstall_signal_handlers(self) -> None:
-        self._signals = self.SignalHandlerOptions.NO
+        if self._world is not None:
+            self.runtime.programs.present.signals = None
 
     def get_current_signal_handlers_options(self) -> Any:
-        return self._signals
+        signals = None if self._world is None else self.runtime.programs.present.signals
+        return signals or self.SignalHandlerOptions.NO
 
     def register_sigint_guard_condition(self, guard: Any) -> None:
         pass
@@ -531,6 +543,10 @@ HANDLES: dict[str, type] = {
 """The classes of the objects that the boundary makes, by their names in rclpy's extension."""
 
 _PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
+_IGNORED_TIME = (
+    "a node publishes /clock, but nodes with use_sim_time show the run's own time: write clocks: "
+    "{source: topic} into the job to make them follow"
+)
 
 
 def _service_types(ends: Iterable[ServiceEndpoint]) -> list[tuple[str, list[str]]]:

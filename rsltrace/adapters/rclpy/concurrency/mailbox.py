@@ -12,12 +12,20 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any, Protocol
 
+from rsltrace.adapters.rclpy.concurrency.callback_groups import is_busy
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.middleware.graph import Graph
 
 
 def servers_text(servers: int) -> str:
     return f"{servers} server{'' if servers == 1 else 's'}"
+
+
+def _shares(end: str, holder: str) -> str:
+    return (
+        f"its {end} shares a mutually exclusive callback group with {holder}, which keeps "
+        f"the group busy; give the {end} a callback group of its own"
+    )
 
 
 def describe_awaited(graph: Graph, future: object) -> str:
@@ -28,11 +36,14 @@ def describe_awaited(graph: Graph, future: object) -> str:
         wrapper = getattr(client, "wrapper", None)
         if future in getattr(wrapper, "_pending_requests", {}).values():
             if client.queue:
-                return (
-                    f"the response of {client.service}, which has arrived, but its client "
-                    "shares a mutually exclusive callback group with this callback, which "
-                    "keeps the group busy; give the client a callback group of its own"
-                )
+                shares = _shares("client", "this callback")
+                return f"the response of {client.service}, which has arrived, but {shares}"
+            for server in graph.services(client.service):
+                owner = getattr(server, "wrapper", None)
+                if server.queue and is_busy(getattr(owner, "callback_group", None), owner):
+                    shares = _shares("server", "a callback that has not ended")
+                    asked = f"the response of {client.service}, whose request has arrived"
+                    return f"{asked}, but {shares}"
             servers = servers_text(len(graph.services(client.service)))
             return f"the response of {client.service} ({servers})"
     actions: list[Any] = [action for node in graph.nodes for action in node.actions]

@@ -256,7 +256,8 @@ def end_programs(runtime: Runtime) -> None:
 def interrupt(runtime: Runtime, program: SimulatedProgram) -> None:
     """Act as SIGINT on a process: the blocking call of its main raises ``KeyboardInterrupt``. (If
     there is none, the caller raises it.)"""
-    shut_down(runtime, program)
+    if program.shuts_down_on("SIGINT"):
+        shut_down(runtime, program)
     blocked = next((one for one in runtime.runners.blocked if one.stack is program.stack), None)
     if blocked is not None:
         blocked.error = KeyboardInterrupt()

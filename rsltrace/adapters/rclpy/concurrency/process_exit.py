@@ -233,7 +233,7 @@ def _signalled_by_default(runtime: Runtime, number: int, call: str) -> bool:
         interrupt(runtime, program)
         if getcurrent() is program.stack:
             raise KeyboardInterrupt
-    elif number == signal.SIGTERM and any(context.ok() for context in program.contexts):
+    elif number == signal.SIGTERM and program.shuts_down_on("SIGTERM"):
         shut_down(runtime, program)
     else:
         _end_process(runtime, f"{call} with {signal.Signals(number).name} for itself", 128 + number)

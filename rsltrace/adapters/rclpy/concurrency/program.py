@@ -106,6 +106,8 @@ class SimulatedProgram:
         """Exceptions of callbacks that left a spin of this program, the latest last."""
         self.exit_handlers: list[ExitHandler] = []
         self.signal_handlers: dict[int, object] = {}
+        self.signals: Any = None
+        """The ``SignalHandlerOptions`` of the handlers that rclpy has installed, None for none."""
         self.stack: greenlet | None = None
         self.spun = False
         """Whether an executor of this program has spun."""
@@ -169,6 +171,10 @@ class SimulatedProgram:
         source = "" if self.entry is None else callback_source(self.entry.make)
         detail: dict[str, object] = {"source": source} if source else {}
         return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", self.begun_ns or 0, detail)
+
+    def shuts_down_on(self, signal: str) -> bool:
+        """Return whether rclpy shuts its contexts down on ``SIGINT`` or ``SIGTERM``."""
+        return getattr(self.signals, "name", "") in (signal, "ALL")
 
     def forget(self) -> None:
         """Drop all objects of user code, so that finalizers run."""

@@ -90,6 +90,8 @@ class ClockHandle(Handle):
     def set_ros_time_override(self, time_point: Any) -> None:
         """Set ROS time, if ``/clock`` drives it."""
         if not self.follows:
+            if self._override:
+                self.boundary.note_ignored_time()
             return
         time_ns = time_point.nanoseconds
         if not self._override:
