@@ -247,9 +247,11 @@ def _run(
     cause: tuple[CallbackSpan, int],
 ) -> Any:
     """Run a task that is a plain function."""
+    recorder.interrupts.hold()
     recorder.begin(int(EventKind.TASK), observed, None, cause)
     failure = None
     try:
+        recorder.interrupts.release()
         return call()
     except BaseException as error:
         failure = failure_of(error)
@@ -286,15 +288,18 @@ class ObservedTask:
     def __await__(self) -> Generator[Any, Any, Any]:
         recorder = self._recorder
         steps = self._call().__await__()
+        recorder.interrupts.hold()  # until what has begun is sure to end
         callback = self._begin()
         while True:
             try:
+                recorder.interrupts.release()
                 step = next(steps)
             except StopIteration as end:
                 recorder.end()
                 return end.value
             except BaseException as error:
                 recorder.end(failure_of(error))
+                steps.close()  # Python warns of one that has not begun
                 raise
             recorder.suspend()
             try:

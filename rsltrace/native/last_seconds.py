@@ -213,7 +213,7 @@ class LastSeconds:
         self._dropped_ns = 0
         self._made: list[Entity] = []
         """The entities of spans that are kept no more."""
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a signal may come in the middle of one
         self._reasons: dict[str, str] = {}
         """Why to write a file: by kinds, the first of each."""
         self.checks: LiveChecks | None = None

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
 from itertools import count
-from types import FrameType
 from typing import Any
 
 from rsltrace.adapters.rclpy.handles.lifecycle import transition_event
@@ -85,8 +84,6 @@ class MessageObserver:
         self._entities = entities
         self._taker = taker
         self._local = threading.local()
-        self._main_thread = threading.main_thread().ident
-        self._main_is_busy = self._is_interrupted = False
         self.on_message: dict[str, Callable[[bytes, Any], object]] = {}
         """Called with the messages on a topic, and of their class."""
         self.unreadable = 0
@@ -169,38 +166,20 @@ class MessageObserver:
 
         return trigger
 
-    def interrupt(self, number: int, frame: FrameType | None) -> None:
-        """Interrupt the main thread as Python does, but not between a message that leaves and the
-        note of it: whoever gets it finds its cause; nor within rclpy, which makes it a TypeError.
-        """
-        if not self._main_is_busy:
-            raise KeyboardInterrupt
-        self._is_interrupted = True
-
     @contextmanager
     def _sending(self) -> Iterator[CallbackSpan]:
-        """Have an event under way that sends something within the block, and says so there."""
-        with self._uninterrupted():
+        """Have an event under way that sends something within the block, and says so there.
+
+        Nothing interrupts it between the message that leaves and the note of it: whoever gets it
+        finds its cause.
+        """
+        with self._recorder.interrupts:
             span = self._recorder.sending()
             try:
                 yield span
             except BaseException:
                 self._recorder.sent(span, None)
                 raise
-
-    @contextmanager
-    def _uninterrupted(self) -> Iterator[None]:
-        is_main = threading.get_ident() == self._main_thread
-        if is_main:
-            self._main_is_busy = True
-        try:
-            yield
-        finally:
-            if is_main:
-                self._main_is_busy = False
-                if self._is_interrupted:
-                    self._is_interrupted = False
-                    raise KeyboardInterrupt
 
     def _sent(
         self,
@@ -229,7 +208,7 @@ class MessageObserver:
             if self._taker is None:
                 found = original(handle, message_type, raw)
             else:
-                with self._uninterrupted():
+                with self._recorder.interrupts:  # rclpy would make it a TypeError
                     found, gid = self._taker(handle, message_type, raw)
             begun_ns = now_ns()
             entity = self._entities.find(handle)

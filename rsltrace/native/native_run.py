@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from types import SimpleNamespace
 from typing import Any
 
@@ -102,14 +103,16 @@ class NativeRun:
     def __post_init__(self) -> None:
         self.error: RunError | None = None
         self.ending: Stop | None = None
-        self.stopped = threading.Event()
+        # A signal handler calls ``stop``, in the middle of whatever the main thread does: an Event
+        # or a Lock, which a thread may take only once, could wait for itself.
+        self._wake_up: SimpleQueue[None] = SimpleQueue()
+        self._lock = threading.RLock()
         self.levels: dict[str, int] = {}
         self.last: LastSeconds | None = None
         self._missing: list[tuple[int, str]] = []
         """Since when (steady) the trace lacks something, or may lack it."""
         self.begun_ns = 0
         self.ended_ns = 0
-        self._lock = threading.Lock()
         self._start_ns = self.job.start_ns or 0
 
     def note(self, text: str) -> None:
@@ -225,7 +228,7 @@ class NativeRun:
 
     def _keep_file(self, reason: str) -> None:
         """Write the last seconds to a file of their own; the run goes on."""
-        if self.stopped.is_set():  # the end of the run is a file, too
+        if self.ending is not None:  # the end of the run is a file, too
             return
         assert self.last is not None
         numbers = (self._output.with_stem(f"{self._output.stem}-{n}") for n in count(1))
@@ -291,8 +294,11 @@ class NativeRun:
     def wait(self) -> Iterator[None]:
         """Yield again and again until the run is over. ``begun_ns`` says since when it lasts."""
         every_s = LOOK_EVERY_S if self.last is None else _LOOK_FOR_LAST_S
-        while not self.stopped.wait(every_s) and self.span_writer.error is None:
-            yield
+        while self.ending is None and self.span_writer.error is None:
+            try:
+                self._wake_up.get(timeout=every_s)
+            except Empty:
+                yield
         self.ended_ns = time.monotonic_ns()
         if self.last is not None:
             self.last.ended_ns = self.ended_ns
@@ -319,7 +325,7 @@ class NativeRun:
         with self._lock:
             if self.ending is None:
                 self.ending = stop
-        self.stopped.set()
+        self._wake_up.put(None)
 
     def fail(self, error: RunError, reason: str = "") -> None:
         """End the run because of an error, from any thread."""

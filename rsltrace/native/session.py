@@ -112,7 +112,7 @@ class SingleProcessRun(NativeRun):
         """Construct the nodes, one entry after the other, then spin all until the run ends."""
         self.span_writer.start()
         for entry in self.entries:
-            if self.stopped.is_set():
+            if self.ending is not None:
                 break
             one = RunningEntry(
                 entry, self.recorder, self.nodes, self._make_executor, self._start, self._ended
@@ -128,7 +128,7 @@ class SingleProcessRun(NativeRun):
     def _wait_for(self, one: RunningEntry) -> None:
         deadline = time.monotonic() + _CONSTRUCTED_WITHIN_S
         while not one.constructed.wait(LOOK_EVERY_S):
-            if self.stopped.is_set() or time.monotonic() > deadline:
+            if self.ending is not None or time.monotonic() > deadline:
                 return
 
     def _make_executor(self) -> Any:

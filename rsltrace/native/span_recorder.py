@@ -11,6 +11,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
+from types import FrameType
 
 from rsltrace.native.observed_entities import ObservedEntity
 from rsltrace.trace.model.entity import Entity
@@ -116,10 +117,45 @@ class RunningCallback:
     span: CallbackSpan | None = None
 
 
+class Interrupts:
+    """Ctrl-C in the main thread, which is held back within a ``with`` block, or from ``hold`` to
+    ``release``. Other threads hold nothing back."""
+
+    def __init__(self) -> None:
+        self._main_thread = threading.main_thread().ident
+        self._are_held = self._has_come = False
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Interrupt the main thread as Python does, but not before it may be."""
+        if not self._are_held:
+            raise KeyboardInterrupt
+        self._has_come = True
+
+    def hold(self) -> None:
+        """Hold back what comes from now on."""
+        if threading.get_ident() == self._main_thread:
+            self._are_held = True
+
+    def release(self) -> None:
+        """Raise what has come meanwhile."""
+        if threading.get_ident() == self._main_thread:
+            self._are_held = False
+            if self._has_come:
+                self._has_come = False
+                raise KeyboardInterrupt
+
+    def __enter__(self) -> None:
+        self.hold()
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+
 class SpanRecorder:
     """Takes what happens, from any thread."""
 
     def __init__(self) -> None:
+        self.interrupts = Interrupts()
         self._lock = threading.Lock()
         self._spans: deque[CallbackSpan] = deque()
         self._local = threading.local()
@@ -181,8 +217,8 @@ class SpanRecorder:
         """Note that the callback that runs in this thread is over."""
         if failure is not None:
             self.add(failure)
-        callback = self._stack().pop()
-        with self._lock:
+        with self.interrupts, self._lock:
+            callback = self._local.stack.pop()
             if callback.span is not None:
                 callback.span.flags |= _RAISED if failure is not None else 0
                 self._close(callback.span)

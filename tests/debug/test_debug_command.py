@@ -294,12 +294,18 @@ def test_ctrl_c_stops_the_run_and_not_the_session(folder: Path, tmp_path: Path) 
     shutil.copytree(folder, long)
     job = (long / "job.yaml").read_text().replace("duration: 3s", "duration: 1000000s")
     (long / "job.yaml").write_text(job)
+    nodes = (long / "nodes_of_debug.py").read_text()
+    there = "        self.count += 1\n        if self.count == 100: open('there', 'w').close()\n"
+    (long / "nodes_of_debug.py").write_text(nodes.replace("        self.count += 1\n", there))
     terminal = Terminal(long, "job.yaml")
     terminal.until("(rsltrace) ")
     terminal.ask("step 10")
     terminal.type("continue\n")
     terminal.until("continue")
-    time.sleep(0.5)
+    limit_s = time.monotonic() + LIMIT_S
+    while not (long / "there").exists():
+        assert time.monotonic() < limit_s, terminal.screen
+        time.sleep(0.05)
     terminal.type("\x03")
     answer = terminal.until("(rsltrace) ")
     assert "interrupted" in answer

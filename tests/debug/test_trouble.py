@@ -380,13 +380,13 @@ def test_a_client_that_is_killed(job: Callable[..., Path]) -> None:
     path = job("subprocess.Popen(['sleep', '600'], start_new_session=True)", duration="3600s")
     script = f"import rsltrace\nrsltrace.DebugSession({str(path)!r}).go_on()\n"
     client = subprocess.Popen([sys.executable, "-c", script])
-    for _ in range(600):
-        pids = marked()
-        if len(pids) > 4 and any(_command(pid) == "sleep" for pid in pids):
-            break
-        time.sleep(0.1)
-    else:
-        pytest.fail("the session has not begun")
+    pids: list[int] = []
+
+    def has_begun() -> bool:
+        pids[:] = marked()
+        return len(pids) > 4 and any(_command(pid) == "sleep" for pid in pids)
+
+    assert eventually(has_begun)
     client.kill()
     client.wait()
     assert gone(pids)

@@ -22,6 +22,7 @@ import pytest
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.reader import Trace
+from tests.free_port import free_port
 from tests.guard.conftest import node_code
 
 pytestmark = pytest.mark.ros
@@ -252,9 +253,7 @@ def test_however_a_socket_is_waited_for_its_answers_are_given_again(
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_server_in_a_node_is_asked_again_by_the_trace(go: Callable[..., Any]) -> None:
     """Whoever asks is outside: in the re-run nobody does."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     code = node_code(
         "pass",
         imports="import socketserver, threading",

@@ -98,5 +98,5 @@ def test_the_audit_of_names_bound_to_each_other_ends(tmp_path: Path) -> None:
         lines += ["    except OSError:", "        sock = spare; spare = sock"]
     (tmp_path / "bound.py").write_text("\n".join([*lines, "    sock.connect()"]) + "\n")
     command = [sys.executable, "-m", "rsltrace", "audit", "bound.py"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr

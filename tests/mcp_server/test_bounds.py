@@ -243,8 +243,15 @@ def until(what: Callable[[], bool]) -> None:
 
 def is_over(pids: Path) -> bool:
     """Return whether the processes that have run nodes are gone."""
-    return not [pid for pid in pids.read_text().split() if Path(f"/proc/{pid}/cmdline").exists()
-                and Path(f"/proc/{pid}/cmdline").read_bytes()]  # fmt: skip
+    return not any(map(has_command, pids.read_text().split()))
+
+
+def has_command(pid: str) -> bool:
+    """Return whether a process is there: what has ended and was not waited for has none."""
+    try:
+        return bool(Path(f"/proc/{pid}/cmdline").read_bytes())
+    except OSError:
+        return False
 
 
 def test_a_command_has_a_limit_of_time() -> None:

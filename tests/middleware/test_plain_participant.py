@@ -251,7 +251,7 @@ print(sorted({"rclpy", "greenlet", "rosidl_parser"} & set(sys.modules)))
 @pytest.mark.long
 def test_without_rclpy_it_lives_in_a_domain_of_its_own() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", ALONE], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", ALONE], capture_output=True, text=True, timeout=600, check=False
     )
     assert done.stdout.splitlines() == [
         "nothing left to do [(0, b'early'), (10, b'tick'), (20, b'tick')] ['/hears']",

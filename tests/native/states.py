@@ -22,19 +22,25 @@ STEPS = (
 )
 
 
+def say_when_found(node: Node) -> None:
+    """Publish on ``/found`` once the manager hears a node: it hears the manager, too."""
+
+    def look() -> None:
+        if found.get_subscription_count():
+            timer.cancel()
+            found.publish(Bool(data=True))
+
+    found = node.create_publisher(Bool, "/found", 10)
+    timer = node.create_timer(0.1, look)
+
+
 class Managed(LifecycleNode):
-    """Publishes once each time it is activated, and on ``/found`` once its manager hears it."""
+    """Publishes once each time it is activated."""
 
     def __init__(self) -> None:
         super().__init__("managed")
         self.sender = self.create_lifecycle_publisher(Float64, "/level", 10)
-        self.found = self.create_publisher(Bool, "/found", 10)
-        self.timer = self.create_timer(0.1, self.look)
-
-    def look(self) -> None:
-        if self.found.get_subscription_count():
-            self.timer.cancel()
-            self.found.publish(Bool(data=True))
+        say_when_found(self)
 
     def on_activate(self, state: Any) -> TransitionCallbackReturn:
         done = super().on_activate(state)
@@ -55,6 +61,7 @@ class ByHand(Node):
         service = Service(handle, GetState, "/by_hand", self.serve, group, qos)
         group.add_entity(service)
         self._services.append(service)
+        say_when_found(self)
 
     def serve(self, request: Any, response: Any) -> Any:
         self.get_logger().info("served")
@@ -77,9 +84,12 @@ class Manager(Node):
         self.create_subscription(Bool, "/found", self.begin, 10)
         self.timer = self.create_timer(0.1, self.look)
         self.timer.cancel()
+        self.unknown = 2
 
     def begin(self, message: Bool) -> None:
-        self.timer.reset()
+        self.unknown -= 1
+        if not self.unknown:
+            self.timer.reset()
 
     def look(self) -> None:
         if self.changes.service_is_ready() and self.other.service_is_ready():

@@ -329,14 +329,13 @@ stop: {{duration: 300s}}
             env=environment(tmp_path),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            text=True,
         )
         try:
-            deadline = time.monotonic() + 120
             kept = tmp_path / f"{number}-1.mcap"
-            while not kept.exists() and time.monotonic() < deadline:
-                time.sleep(0.05)
+            wait_until(kept.exists, process)
             process.send_signal(signal.SIGINT)
-            process.wait(timeout=120)
+            process.wait(timeout=PATIENCE_S)
         finally:
             process.kill()
             process.wait()
@@ -351,7 +350,10 @@ def test_a_killed_program_a_signal_and_the_end_write_files(
     text = f"""
 nodes:
   - {{node: robot:Talker}}
-  - {{program: {compiled("counter.c")}, arguments: ['10', kill], on_exception: log}}
+  - program: {compiled("counter.c")}
+    arguments: ['10', kill]
+    on_exception: log
+    start_after: {{started: robot:Talker, delay: 1s}}  # there is a file soon after its end
   - {{program: {compiled("../native/counting.c")}, arguments: [b, "200000", "10"], name: b}}
 record: {{last: 8s}}
 """

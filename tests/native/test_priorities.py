@@ -16,6 +16,7 @@ from rsltrace.cli.record import record
 from rsltrace.native.priorities import LEVEL_MAX, LEVEL_MIN, level_of_period
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
+from tests.native.running import PATIENCE_S
 from tests.native.running import record as run_natively
 
 needs_rclpy = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="needs rclpy")
@@ -36,7 +37,7 @@ def recorded_order(
     command = [*without, *COMMAND, "job.yaml", "-o", "run.mcap", "--force", *words]
     environment = {**os.environ, "ROS_LOG_DIR": str(folder / "log")}
     done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert done.returncode == 0, done.stderr
     with Trace.open(folder / "run.mcap") as trace:

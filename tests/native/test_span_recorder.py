@@ -89,7 +89,7 @@ def test_an_interrupt_waits_until_what_was_sent_is_noted() -> None:
     entities = ObservedEntities(recorder.add)
     observer = MessageObserver(recorder, entities)
     recorder.begin(TIMER, THING)
-    before = signal.signal(signal.SIGINT, observer.interrupt)
+    before = signal.signal(signal.SIGINT, recorder.interrupts.handle)
     try:
         with observer.watched(MagicMock(Publisher=Publisher)):
             handle = Publisher()
@@ -115,8 +115,9 @@ def test_an_interrupt_waits_until_a_message_is_taken() -> None:
         taken.append(True)
         return None, b""
 
-    observer = MessageObserver(SpanRecorder(), ObservedEntities(lambda _: None), take)
-    before = signal.signal(signal.SIGINT, observer.interrupt)
+    recorder = SpanRecorder()
+    observer = MessageObserver(recorder, ObservedEntities(lambda _: None), take)
+    before = signal.signal(signal.SIGINT, recorder.interrupts.handle)
     try:
         with (
             observer.watched(MagicMock(Subscription=Subscription)),
@@ -126,6 +127,46 @@ def test_an_interrupt_waits_until_a_message_is_taken() -> None:
     finally:
         signal.signal(signal.SIGINT, before)
     assert taken == [True]
+
+
+@pytest.mark.parametrize("kind", [TIMER, int(EventKind.TASK)])
+def test_a_callback_that_is_interrupted_as_it_begins_has_raised(kind: int) -> None:
+    """It is an event, since what it got is no more, and its end is not that of another."""
+    from rsltrace.native.callback_observer import ObservedTask, _run
+
+    class Interrupted(SpanRecorder):
+        def time_ns(self) -> int:
+            os.kill(os.getpid(), signal.SIGINT)
+            return super().time_ns()
+
+    ran: list[bool] = []
+
+    async def call() -> None:
+        ran.append(True)
+
+    def task() -> None:
+        _run(recorder, THING, lambda: ran.append(True), cause)
+
+    def callback() -> None:
+        next(ObservedTask(recorder, kind, THING, call, None).__await__())
+
+    recorder = SpanRecorder()
+    main = recorder.begin(int(EventKind.CONSTRUCT), THING)
+    cause = recorder.add(TaskCreation())
+    recorder.pause(THING)
+    recorder.__class__ = Interrupted
+    before = signal.signal(signal.SIGINT, recorder.interrupts.handle)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            (callback if kind == TIMER else task)()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert recorder.current() is main
+    recorder.end()
+    spans = recorder.finished(LONG_NS)
+    assert kinds(spans) == [int(EventKind.CONSTRUCT), kind]
+    assert spans[1].flags == EventFlag.RAISED
+    assert ran == []
 
 
 def test_threads_that_share_a_publisher_count_as_the_middleware_does() -> None:

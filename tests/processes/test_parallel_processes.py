@@ -157,7 +157,7 @@ def test_two_compute_at_the_same_time(tmp_path: Path) -> None:
         "stop: {duration: 750ms}\n"
     )
     command = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "t.mcap", "--quiet"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "t.mcap") as trace:
         met = {

@@ -93,15 +93,15 @@ def test_a_web_viewer_says_at_which_address_it_is(trace: Path) -> None:
             line = process.stdout.readline()
             found = re.match(r"open (http://127\.0\.0\.1:\d+/\?url=(\S+)) in a browser", line)
             assert found is not None
-            with urllib.request.urlopen(found[1], timeout=60) as page:
+            with urllib.request.urlopen(found[1], timeout=600) as page:
                 assert page.status == 200
                 assert b"<html" in page.read().lower()
             data = urllib.parse.urlsplit(urllib.parse.unquote(found[2]))
             assert (data.scheme, data.path) == ("rerun+http", "/proxy")
-            socket.create_connection((str(data.hostname), int(data.port or 0)), timeout=60).close()
+            socket.create_connection((str(data.hostname), int(data.port or 0)), timeout=600).close()
         finally:
             os.killpg(process.pid, signal.SIGINT)  # as Ctrl-C does, to the viewer as well
-            process.wait(60)
+            process.wait(600)
 
 
 def test_what_is_opened_is_a_temporary_recording(

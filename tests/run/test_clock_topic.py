@@ -171,7 +171,7 @@ def test_it_is_as_over_dds(tmp_path: Path) -> None:
         [sys.executable, str(tmp_path / "program.py")],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=True,
     )
     native = re.findall(r"\[INFO\] \[[\d.]+\] \[robot\]: (.*)", done.stderr)

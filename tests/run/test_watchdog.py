@@ -237,10 +237,10 @@ def test_a_debugger_is_no_alarm(
 
 @pytest.mark.long
 def test_it_is_gone_after_the_run(tmp_path: Path) -> None:
-    def threads() -> int:
-        return len(os.listdir("/proc/self/task"))
+    def threads() -> set[str]:
+        return set(os.listdir("/proc/self/task"))
 
-    seen: list[int] = []
+    seen: list[set[str]] = []
 
     class Look(Node):
         def __init__(self) -> None:
@@ -252,11 +252,11 @@ def test_it_is_gone_after_the_run(tmp_path: Path) -> None:
     rsltrace.record(job, tmp_path / "a.mcap")  # loads what starts threads of its own
     before = threads()
     rsltrace.record(job, tmp_path / "a.mcap", force=True)
-    assert seen[-1] == before + 1
+    assert len(seen[-1] - before) == 1
     deadline = time.monotonic() + 600
-    while threads() != before and time.monotonic() < deadline:
+    while threads() - before and time.monotonic() < deadline:
         time.sleep(0.01)  # the system takes a moment to clear a thread away that has ended
-    assert threads() == before
+    assert threads() <= before
 
 
 @pytest.mark.long

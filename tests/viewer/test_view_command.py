@@ -23,6 +23,7 @@ from rsltrace_viewer.terminal.choose import ChooseApp
 
 from rsltrace.cli.main import cli
 from rsltrace.trace.reader import Trace
+from tests.free_port import free_port
 
 
 def view(*arguments: object) -> Result:
@@ -182,9 +183,7 @@ def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
 @pytest.mark.long
 def test_in_a_browser_on_this_machine_only(made: Path) -> None:
     pytest.importorskip("textual_serve")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-m", "rsltrace", "view", str(made), "--serve", "--port", str(port)]
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
@@ -238,7 +237,7 @@ async def _viewers_end_with(url: str, server: subprocess.Popen[str]) -> None:
         viewers = _children(server.pid)
         assert viewers
         server.kill()
-        for _ in range(600):
+        for _ in range(6000):
             if not any(Path(f"/proc/{pid}").exists() for pid in viewers):
                 return
             await asyncio.sleep(0.1)

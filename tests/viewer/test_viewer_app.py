@@ -64,7 +64,7 @@ def test_the_inspector_follows_an_event_that_gets_another_place(
     async def steps(viewer: Any) -> None:
         viewer.app.go(3)
         viewer.app.session.place = 5
-        for _ in range(100):
+        for _ in range(20_000):  # ten minutes
             await asyncio.sleep(0.03)
             if not viewer.app.busy:
                 break

@@ -71,7 +71,7 @@ class RunningMain:
         failure = None
         try:
             # Asyncio compares the handler with this one before it puts its own in place.
-            interrupt = self._observers.message_observer.interrupt
+            interrupt = recorder.interrupts.handle
             signal.default_int_handler = interrupt  # type: ignore[assignment]
             signal.signal(signal.SIGINT, interrupt)
             status = entry.make()
