@@ -10,6 +10,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 
@@ -133,8 +134,7 @@ class EventColumns:
 
     @cached_property
     def _output_starts(self) -> list[int]:
-        starts = np.cumsum([0, *self.output_counts], dtype=np.int64)
-        return [int(start) for start in starts]
+        return list(accumulate(self.output_counts, initial=0))
 
     @cached_property
     def _output_rows(self) -> list[OutputRow]:
