@@ -88,8 +88,8 @@ def match(a: EventSequence, b: EventSequence, *, surest_only: bool) -> list[Pair
 def _same_ends(a: EventSequence, b: EventSequence) -> tuple[int, int]:
     """Return how many events at the beginning and at the end are certainly pairs."""
     begin = _certain(a.columns, b.columns)
-    end = _certain(*([column[::-1] for column in one.columns] for one in (a, b)))
-    return begin, min(end, len(a) - begin, len(b) - begin)
+    end = _certain(*([column[begin:][::-1] for column in one.columns] for one in (a, b)))
+    return begin, end
 
 
 def _certain(a: Iterable[Sequence[int]], b: Iterable[Sequence[int]]) -> int:
