@@ -272,9 +272,7 @@ def read_summary(source: ByteSource) -> TraceIndex:
         ]
 
     index.chunks_with = lambda channels: [
-        chunk
-        for chunk in (chunks() if channels else ())
-        if not channels.isdisjoint(chunk.starts)
+        chunk for chunk in (chunks() if channels else ()) if not channels.isdisjoint(chunk.starts)
     ]
     check_version(source, index)
     if ATTACHMENT_INDEX not in index.attachments:

@@ -164,9 +164,7 @@ class PayloadReader:
     def _read_records(self, span: RecordSpan) -> bytes:
         return read_chunk(self._source, span)
 
-    def _read_offsets(
-        self, span: RecordSpan, index: tuple[int, int], channel_id: int
-    ) -> list[int]:
+    def _read_offsets(self, span: RecordSpan, index: tuple[int, int], channel_id: int) -> list[int]:
         """Return the offsets of a channel's messages in the records of a chunk."""
         index_span = RecordSpan(*index)
         if index_span.length <= MESSAGE_INDEX_FIXED:
