@@ -96,12 +96,13 @@ def _certain(a: Iterable[Sequence[int]], b: Iterable[Sequence[int]]) -> int:
     """Return how many events from the beginning are certainly pairs; the arguments are columns."""
     count = 0
     for mine, theirs in zip(zip(*a, strict=True), zip(*b, strict=True), strict=False):
-        stamp, received, cause, nth = mine
-        other_stamp, other_received, other_cause, other_nth = theirs
-        if stamp != other_stamp or cause != other_cause:
-            break
-        if received != other_received and (cause < 0 or nth != other_nth):
-            break
+        if mine != theirs:
+            stamp, received, cause, nth = mine
+            other_stamp, other_received, other_cause, other_nth = theirs
+            if stamp != other_stamp or cause != other_cause:
+                break
+            if received != other_received and (cause < 0 or nth != other_nth):
+                break
         count += 1
     return count
 
