@@ -2,8 +2,7 @@
 
 Python's compiles up to seven functions for each class. Here one ``__init__`` is compiled for each
 number of fields and copied with their names, and the rest is shared. What ``dataclasses.fields``
-tells is made when it is asked for. Comparing objects takes longer, so classes of events and
-messages are Python's. Type checkers see Python's.
+tells is made when it is asked for. Type checkers see Python's.
 """
 
 from __future__ import annotations
@@ -32,6 +31,13 @@ _assign = object.__setattr__
 _NO_DEFAULT = object()
 
 
+class _Factory:
+    """The default of a field whose value is made for each object."""
+
+    def __init__(self, make: Callable[[], object]) -> None:
+        self.make = make
+
+
 def _decorate(cls: Any, *, eq: bool, frozen: bool, slots: bool) -> Any:
     body = {k: v for k, v in vars(cls).items() if k not in ("__dict__", "__weakref__")}
     inherited = getattr(cls, "_plain_fields", None) or {}
@@ -44,7 +50,7 @@ def _decorate(cls: Any, *, eq: bool, frozen: bool, slots: bool) -> Any:
     else:
         compared = [*fields]
         defaults = tuple(v for v in fields.values() if v is not _NO_DEFAULT)
-        init = _init(tuple(fields), defaults, frozen=frozen)
+        init = _init(fields, defaults, frozen=frozen, more=hasattr(cls, "__post_init__"))
         init.__qualname__ = f"{cls.__qualname__}.__init__"
         own = {
             "__init__": init,
@@ -59,6 +65,11 @@ def _decorate(cls: Any, *, eq: bool, frozen: bool, slots: bool) -> Any:
             made = cls.__class__(cls.__name__, cls.__bases__, own | kept)
             made.__qualname__ = cls.__qualname__
         else:
+            for name, value in body.items():
+                if isinstance(value, dataclasses.Field):
+                    delattr(made, name)
+                    if value.default is not dataclasses.MISSING:
+                        own[name] = value.default
             for name, value in own.items():
                 setattr(made, name, value)
             vars(made)["__dataclass_fields__"].__set_name__(made, "")
@@ -82,17 +93,26 @@ def _plain_fields(cls: Any, body: dict[str, Any]) -> dict[str, object] | None:
         fields = {}
         if hasattr(cls, "__dataclass_fields__"):
             return None
-    annotations = cls.__annotations__
-    fields = fields | {name: body.get(name, _NO_DEFAULT) for name in annotations}
-    defaults = [value is not _NO_DEFAULT for value in fields.values()]
-    if (
-        sorted(defaults) != defaults
-        or hasattr(cls, "__post_init__")
-        or any(isinstance(v, dataclasses.Field) or v.__hash__ is None for v in fields.values())
-        or any("ClassVar" in str(text) for text in annotations.values())
+    own = [name for name, text in cls.__annotations__.items() if "ClassVar" not in str(text)]
+    given = [body[name] for name in own if name in body]
+    if any(
+        not value.init or not value.compare or value.hash is not None or value.kw_only is True
+        if isinstance(value, dataclasses.Field)
+        else value.__hash__ is None
+        for value in given
     ):
         return None
-    return fields
+    fields = fields | {name: _default(body.get(name, _NO_DEFAULT)) for name in own}
+    defaults = [value is not _NO_DEFAULT for value in fields.values()]
+    return fields if sorted(defaults) == defaults else None
+
+
+def _default(value: object) -> object:
+    if not isinstance(value, dataclasses.Field):
+        return value
+    if value.default_factory is not dataclasses.MISSING:
+        return _Factory(value.default_factory)
+    return _NO_DEFAULT if value.default is dataclasses.MISSING else value.default
 
 
 class _Description:
@@ -111,12 +131,16 @@ class _Description:
         return made.__dataclass_fields__
 
 
-def _init(names: tuple[str, ...], defaults: tuple[object, ...], *, frozen: bool) -> FunctionType:
-    """Return an ``__init__`` that sets the attributes of these names."""
-    code = _template(len(names), frozen).__code__
-    given = {f"_{place}": name for place, name in enumerate(names)}
+def _init(
+    fields: dict[str, object], defaults: tuple[object, ...], *, frozen: bool, more: bool
+) -> FunctionType:
+    """Return an ``__init__`` that sets the attributes of these names; ``more``: and then calls
+    ``__post_init__``."""
+    made = tuple(place for place, value in enumerate(fields.values()) if type(value) is _Factory)
+    code = _template(len(fields), frozen, made, more).__code__
+    given = {f"_{place}": name for place, name in enumerate(fields)}
     code = code.replace(
-        co_varnames=("self", *names),
+        co_varnames=("self", *fields),
         co_names=tuple(given.get(name, name) for name in code.co_names),
         co_consts=tuple(given.get(constant, constant) for constant in code.co_consts),
     )
@@ -124,15 +148,17 @@ def _init(names: tuple[str, ...], defaults: tuple[object, ...], *, frozen: bool)
 
 
 @cache
-def _template(count: int, frozen: bool) -> FunctionType:
+def _template(count: int, frozen: bool, made: tuple[int, ...], more: bool) -> FunctionType:
     names = [f"_{place}" for place in range(count)]
-    lines = [
+    lines = [f"    if type(_{at}) is _Factory: _{at} = _{at}.make()" for at in made]
+    lines += [
         f"    _assign(self, {name!r}, {name})" if frozen else f"    self.{name} = {name}"
         for name in names
     ]
-    made: dict[str, FunctionType] = {}
-    exec("\n".join([f"def __init__({', '.join(['self', *names])}):", *lines, "    pass"]), made)
-    return made["__init__"]
+    lines.append("    self.__post_init__()" if more else "    pass")
+    scope: dict[str, FunctionType] = {}
+    exec("\n".join([f"def __init__({', '.join(['self', *names])}):", *lines]), scope)
+    return scope["__init__"]
 
 
 def _values(names: list[str]) -> Callable[[Any], Any]:

@@ -5,7 +5,8 @@ An interrupted trace has no summary; ``scan`` makes the same index by walking th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import field
 from functools import cache
 from itertools import accumulate, chain
@@ -40,7 +41,6 @@ from rsltrace.trace.mcap.records import (
     RecordFields,
     RecordSpan,
     TruncatedFile,
-    parse_chunk_index,
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource
@@ -149,15 +149,34 @@ class ChannelInfo:
 
 
 class ChunkEntry(NamedTuple):
-    """A chunk: its span, its number of messages by channel, and the spans of their indexes.
+    """A chunk: its span, the offsets of its message indexes by channel, and where each ends or the
+    next begins, rising.
 
-    A channel without index (the file was cut off behind the chunk), or with an empty one (events
-    and outputs), is found by walking; its count is then 0.
+    ``walked`` are the numbers of messages by channel where the chunk was walked: a channel has no
+    index if the file was cut off behind the chunk.
     """
 
     span: RecordSpan
-    counts: Mapping[int, int]
-    indexes: Mapping[int, RecordSpan]
+    starts: dict[int, int]
+    ends: list[int]
+    walked: Mapping[int, int] | None = None
+
+    @property
+    def channels(self) -> Iterable[int]:
+        return self.starts if self.walked is None else self.walked
+
+    def index_of(self, channel_id: int) -> tuple[int, int]:
+        """Return offset and length of the index of a channel (0: there is none)."""
+        at = self.starts.get(channel_id, 0)
+        place = bisect_right(self.ends, at)
+        return (at, self.ends[place] - at) if at and place < len(self.ends) else (0, 0)
+
+    def count_of(self, channel_id: int) -> int:
+        """Return how many messages of one of its channels it has: 0 where its index is empty (of
+        events and outputs)."""
+        if self.walked is not None:
+            return self.walked[channel_id]
+        return max(self.index_of(channel_id)[1] - MESSAGE_INDEX_FIXED, 0) // _INDEX_ENTRY_BYTES
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,30 +263,22 @@ def read_summary(source: ByteSource) -> TraceIndex:
     except DamageError as error:
         raise damage_error(source, footer.summary_start, "the summary", error) from error
     index.take(summary)
-    # Kept, since with hundreds of topics nearly every chunk is asked for by each of these.
-    entry = cache(_chunk_entry)
-    index.chunks_with = lambda channels: [*map(entry, summary.chunk_indexes(channels))]
+
+    @cache
+    def chunks() -> list[ChunkEntry]:
+        return [
+            ChunkEntry(chunk.span, chunk.indexes, sorted((*chunk.indexes.values(), chunk.end)))
+            for chunk in summary.chunks()
+        ]
+
+    index.chunks_with = lambda channels: [
+        chunk for chunk in (chunks() if channels else ()) if not channels.isdisjoint(chunk.starts)
+    ]
     check_version(source, index)
     if ATTACHMENT_INDEX not in index.attachments:
         raise TraceFormatError(f"{source.name} is incomplete: {ATTACHMENT_INDEX} is missing in it")
     index.segments = _read_segments(source, index.attachments[ATTACHMENT_INDEX])
     return index
-
-
-def _chunk_entry(body: bytes) -> ChunkEntry:
-    chunk = parse_chunk_index(body)
-    # Each index ends where the next one begins, which gives the number of messages.
-    starts = sorted((at, channel_id) for channel_id, at in chunk.indexes)
-    ends = [*(at for at, _ in starts[1:]), chunk.end]
-    indexes = {
-        channel_id: RecordSpan(at, end - at)
-        for (at, channel_id), end in zip(starts, ends, strict=False)
-    }
-    counts = {
-        channel_id: (span.length - MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
-        for channel_id, span in indexes.items()
-    }
-    return ChunkEntry(chunk.span, counts, indexes)
 
 
 def check_version(source: ByteSource, index: TraceIndex) -> None:

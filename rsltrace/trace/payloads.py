@@ -54,7 +54,7 @@ class PayloadReader:
         if position < 0:
             raise self._missing(channel_id, sequence)
         entry = entries[position]
-        offsets = self._offsets(entry.span, entry.indexes.get(channel_id), channel_id)
+        offsets = self._offsets(entry.span, entry.index_of(channel_id), channel_id)
         place = sequence - firsts[position]
         if place >= len(offsets):
             raise self._missing(channel_id, sequence)
@@ -73,12 +73,12 @@ class PayloadReader:
         """Yield (channel, stamp in ns, sequence, data) of all messages of some channels, in file
         order."""
         for entry in self._chunks_with(channel_ids):
-            wanted = [c for c in entry.counts if c in channel_ids]
+            wanted = [c for c in entry.channels if c in channel_ids]
             records = self._read_records(entry.span)
             places = [
                 (offset, c)
                 for c in wanted
-                for offset in self._read_offsets(entry.span, entry.indexes.get(c), c)
+                for offset in self._read_offsets(entry.span, entry.index_of(c), c)
             ]
             try:
                 for offset, channel_id in sorted(places):
@@ -93,7 +93,7 @@ class PayloadReader:
         other tools walk through it."""
         for entry in self._chunks_with(frozenset(self._index.channels)):
             records, at = self._read_records(entry.span), 0
-            found = [self._read_offsets(entry.span, entry.indexes.get(c), c) for c in entry.counts]
+            found = [self._read_offsets(entry.span, entry.index_of(c), c) for c in entry.channels]
             for offset in sorted(chain.from_iterable(found)):
                 if offset != at or at + RECORD_HEAD.size > len(records):
                     break
@@ -157,18 +157,17 @@ class PayloadReader:
             entries = self._chunks_with(frozenset((channel_id,)))
             for entry in entries:
                 firsts.append(count)
-                count += entry.counts[channel_id]
+                count += entry.count_of(channel_id)
             found = self._by_channel[channel_id] = (firsts, entries)
         return found
 
     def _read_records(self, span: RecordSpan) -> bytes:
         return read_chunk(self._source, span)
 
-    def _read_offsets(
-        self, span: RecordSpan, index_span: RecordSpan | None, channel_id: int
-    ) -> list[int]:
+    def _read_offsets(self, span: RecordSpan, index: tuple[int, int], channel_id: int) -> list[int]:
         """Return the offsets of a channel's messages in the records of a chunk."""
-        if index_span is None or index_span.length <= MESSAGE_INDEX_FIXED:
+        index_span = RecordSpan(*index)
+        if index_span.length <= MESSAGE_INDEX_FIXED:
             try:
                 walked = messages_in(self._records(span))
                 return [offset for channel, offset in walked if channel == channel_id]

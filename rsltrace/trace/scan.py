@@ -88,11 +88,11 @@ class _Scanner:
         if self._rows:
             index.segments = SegmentTable(np.array(self._rows, dtype=SEGMENT_DTYPE).tobytes())
         for entry in self._chunks:
-            for channel_id, count in entry.counts.items():
-                total = index.message_counts.get(channel_id, 0) + count
+            for channel_id in entry.channels:
+                total = index.message_counts.get(channel_id, 0) + entry.count_of(channel_id)
                 index.message_counts[channel_id] = total
         index.chunks_with = lambda channels: [
-            entry for entry in self._chunks if not channels.isdisjoint(entry.counts)
+            entry for entry in self._chunks if not channels.isdisjoint(entry.channels)
         ]
         return index
 
@@ -120,10 +120,10 @@ class _Scanner:
             self._output_channel = ids.get(TOPIC_OUTPUTS, -1)
 
     def _message_index(self, span: RecordSpan, channel_id: int) -> None:
-        if not self._chunks or channel_id not in self._chunks[-1].counts:
+        if not self._chunks or channel_id not in self._chunks[-1].channels:
             raise DamageError("it is not the index of the chunk before it")
-        last = self._chunks[-1]
-        self._chunks[-1] = last._replace(indexes={**last.indexes, channel_id: span})
+        self._chunks[-1].starts[channel_id] = span.offset
+        self._chunks[-1].ends.append(span.end)
 
     def _chunk(self, span: RecordSpan) -> None:
         records = read_chunk(self._source, span)
@@ -139,7 +139,7 @@ class _Scanner:
             counts = Counter(channel_id for channel_id, _ in messages_in(records))
             for channel_id in counts.keys() - self._summary.channels.keys():
                 raise DamageError(f"it has messages of channel {channel_id}, which is not there")
-        self._chunks.append(ChunkEntry(span, counts, {}))
+        self._chunks.append(ChunkEntry(span, {}, [], counts))
 
     def _check_channels(self) -> None:
         """Check that rsltrace's channels precede the chunks: no checksum covers their names."""

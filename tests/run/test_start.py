@@ -12,7 +12,7 @@ import subprocess
 import sys
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from click.testing import CliRunner
@@ -183,6 +183,43 @@ def test_a_quick_dataclass_inherits_fields_as_pythons_does(given: Any, slots: bo
         if slots:
             assert one.__slots__ == list(other.__slots__)
         assert list(inspect.signature(one).parameters) == list(inspect.signature(other).parameters)
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+@pytest.mark.parametrize("slots", [True, False])
+def test_a_quick_dataclass_makes_defaults_as_pythons_does(frozen: bool, slots: bool) -> None:
+    def make(decorate: Any) -> Any:
+        @decorate(frozen=frozen, slots=slots)
+        class Made:
+            limit: ClassVar[int] = 3
+
+            a: int
+            b: list[int] = dataclasses.field(default_factory=list)
+            c: int = dataclasses.field(default=5, repr=False)
+            d: str = "d"
+
+            def __post_init__(self) -> None:
+                self.b.append(self.a + self.limit)
+
+        return Made
+
+    quick, own = make(fast_dataclass.dataclass), make(dataclasses.dataclass)
+    assert quick._plain_fields is not None, "this takes Python's way"
+    told = [
+        [repr(cls(1)), repr(cls(2, [1], d="e")), repr(cls(1)), cls(1).c, cls(1, c=2).c]
+        for cls in (quick, own)
+    ]
+    assert told[0] == told[1]
+    assert quick(1) == quick(1) != quick(1, c=2)
+    assert quick(1).b is not quick(1).b
+    fields = [
+        [(f.name, f.default, f.default_factory, f.repr) for f in dataclasses.fields(c)]
+        for c in (quick, own)
+    ]
+    assert fields[0] == fields[1]
+    for name in ("a", "b"):
+        assert hasattr(quick, name) is hasattr(own, name) is slots
+    assert dataclasses.replace(quick(1, [2]), a=7).b == dataclasses.replace(own(1, [2]), a=7).b
 
 
 def test_versions_are_those_of_the_packages_metadata() -> None:

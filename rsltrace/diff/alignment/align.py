@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import itertools
 from bisect import bisect_left, bisect_right
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import field
 
 from rsltrace.diff.alignment.rows import EventColumns
@@ -67,6 +67,10 @@ class EventSequence:
     def __len__(self) -> int:
         return len(self.stamp)
 
+    @property
+    def columns(self) -> tuple[Sequence[int], ...]:
+        return self.stamp, self.input, self.cause, self.nth
+
 
 def match(a: EventSequence, b: EventSequence, *, surest_only: bool) -> list[Pair]:
     """Return pairs of positions: which event of ``a`` is which of ``b``."""
@@ -83,21 +87,24 @@ def match(a: EventSequence, b: EventSequence, *, surest_only: bool) -> list[Pair
 
 def _same_ends(a: EventSequence, b: EventSequence) -> tuple[int, int]:
     """Return how many events at the beginning and at the end are certainly pairs."""
-    most = min(len(a), len(b))
-    begin = 0
-    while begin < most and _surely(a, b, begin, begin):
-        begin += 1
-    end = 0
-    while end < most - begin and _surely(a, b, len(a) - 1 - end, len(b) - 1 - end):
-        end += 1
+    begin = _certain(a.columns, b.columns)
+    end = _certain(*([column[begin:][::-1] for column in one.columns] for one in (a, b)))
     return begin, end
 
 
-def _surely(a: EventSequence, b: EventSequence, i: int, j: int) -> bool:
-    cause = a.cause[i]
-    if a.stamp[i] != b.stamp[j] or cause != b.cause[j]:
-        return False
-    return (cause >= 0 and a.nth[i] == b.nth[j]) or a.input[i] == b.input[j]
+def _certain(a: Iterable[Sequence[int]], b: Iterable[Sequence[int]]) -> int:
+    """Return how many events from the beginning are certainly pairs; the arguments are columns."""
+    count = 0
+    for mine, theirs in zip(zip(*a, strict=True), zip(*b, strict=True), strict=False):
+        if mine != theirs:
+            stamp, received, cause, nth = mine
+            other_stamp, other_received, other_cause, other_nth = theirs
+            if stamp != other_stamp or cause != other_cause:
+                break
+            if received != other_received and (cause < 0 or nth != other_nth):
+                break
+        count += 1
+    return count
 
 
 class _Matching:
@@ -310,12 +317,20 @@ def align(
     """Match the events of two blocks. Those whose indexes are in ``taken_a`` and ``taken_b``
     have partners in an earlier block and are left alone."""
     groups = _groups(a, b, taken_a, taken_b)
-    pairs = EventPairs([], [])
+    causes_a, causes_b = _earlier_causes(a, b, past)
+    caused_a, caused_b = _caused_in(a), _caused_in(b)
+    pairs: EventPairs | None = None
     before: tuple[bool, list[int], list[int]] | None = None
     # The partner of an event's cause is a strong sign, and known only when causes are matched: so
     # what is certain without it comes first, and then everything is matched again with it.
     for surest_only in (True, False, False):
-        causes_a, causes_b = _causes(a, b, pairs, past)
+        if pairs is not None:
+            causes_a, causes_b = [*causes_a], [*causes_b]
+            for place, at in caused_a:
+                causes_a[place] = a.first + at if pairs.a[at] >= 0 else UNKNOWN
+            for place, at in caused_b:
+                partner = pairs.b[at]
+                causes_b[place] = a.first + partner if partner >= 0 else UNKNOWN
         known = surest_only, causes_a, causes_b
         if known == before:
             break  # the same pairs would come out again
@@ -329,6 +344,7 @@ def align(
             for i, j in match(sequence_a, sequence_b, surest_only=surest_only):
                 pairs.a[places_a[i]] = places_b[j]
                 pairs.b[places_b[j]] = places_a[i]
+    assert pairs is not None
     return pairs
 
 
@@ -340,42 +356,33 @@ def _sequence(rows: EventColumns, causes: list[int], places: list[int]) -> Event
 def _groups(
     a: EventColumns, b: EventColumns, taken_a: set[int], taken_b: set[int]
 ) -> list[tuple[list[int], list[int]]]:
-    groups: dict[tuple[int, int], tuple[list[int], list[int]]] = {}
+    groups: defaultdict[tuple[int, int], tuple[list[int], list[int]]]
+    groups = defaultdict(lambda: ([], []))
     for rows, taken, side in ((a, taken_a, 0), (b, taken_b, 1)):
         for place, key in enumerate(zip(rows.number, rows.kind, strict=True)):
-            if rows.first + place not in taken:
-                groups.setdefault(key, ([], []))[side].append(place)
+            if not taken or rows.first + place not in taken:
+                groups[key][side].append(place)
     return [group for group in groups.values() if group[0] and group[1]]
 
 
-def _causes(
-    a: EventColumns, b: EventColumns, pairs: EventPairs, past: EarlierPairs
+def _earlier_causes(
+    a: EventColumns, b: EventColumns, past: EarlierPairs
 ) -> tuple[list[int], list[int]]:
     """Return the causes of all events as indexes in a, so that equal causes are equal numbers.
 
-    NO_CAUSE for events without one, UNKNOWN where the cause has (as yet) no counterpart.
+    NO_CAUSE for events without one, UNKNOWN where no earlier block has a counterpart of the cause.
     """
-    # Of an event of this block: its index, if it has a counterpart.
-    own_a = [a.first + i if j >= 0 else UNKNOWN for i, j in enumerate(pairs.a)]
-    own_b = [a.first + i if i >= 0 else UNKNOWN for i in pairs.b]
-    first, end = a.first, a.first + len(own_a)
     causes_a = [
-        NO_CAUSE
-        if cause == NO_EVENT
-        else own_a[cause - first]
-        if first <= cause < end
-        else cause
-        if past.has_partner(cause)
-        else UNKNOWN
+        NO_CAUSE if cause == NO_EVENT else cause if past.has_partner(cause) else UNKNOWN
         for cause in a.cause
     ]
-    first, end = b.first, b.first + len(own_b)
-    causes_b = [
-        NO_CAUSE
-        if cause == NO_EVENT
-        else own_b[cause - first]
-        if first <= cause < end
-        else past.in_a(cause)
-        for cause in b.cause
-    ]
+    causes_b = [NO_CAUSE if cause == NO_EVENT else past.in_a(cause) for cause in b.cause]
     return causes_a, causes_b
+
+
+def _caused_in(rows: EventColumns) -> list[Pair]:
+    """Return the places of events whose cause is in the block, and of that."""
+    first, end = rows.first, rows.end
+    return [
+        (place, cause - first) for place, cause in enumerate(rows.cause) if first <= cause < end
+    ]

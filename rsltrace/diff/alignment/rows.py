@@ -10,6 +10,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 
@@ -133,8 +134,7 @@ class EventColumns:
 
     @cached_property
     def _output_starts(self) -> list[int]:
-        starts = np.cumsum([0, *self.output_counts], dtype=np.int64)
-        return [int(start) for start in starts]
+        return list(accumulate(self.output_counts, initial=0))
 
     @cached_property
     def _output_rows(self) -> list[OutputRow]:
@@ -162,14 +162,14 @@ def load_rows(run: ComparedTrace, first: int, last: int) -> EventColumns:
         numbers += run.matching.numbers(run.trace, part["entity"], of_b=run.of_b).tolist()
         for name, values in columns.items():
             values += part[name].tolist()
-    nodes = run.matching.nodes
-    stateful = {n: n for n, key in enumerate(run.matching.keys) if key.kind in OF_THEIR_OWN}
+    own = [n if key.kind in OF_THEIR_OWN else 0 for n, key in enumerate(run.matching.keys)]
+    owners = [node or n for node, n in zip(run.matching.nodes, own, strict=True)]
     rows = EventColumns(
         run=run,
         first=first,
         at_end=first + len(numbers) >= run.trace.event_count,
         number=numbers,
-        owner=[nodes[number] or stateful.get(number, 0) for number in numbers],
+        owner=[*map(owners.__getitem__, numbers)],
         kind=columns["kind"],
         stamp=columns["stamp"],
         input=columns["input_hash"],
@@ -180,11 +180,12 @@ def load_rows(run: ComparedTrace, first: int, last: int) -> EventColumns:
         cause_output=columns["cause_output"],
         output_counts=columns["outputs"],
     )
-    for place, kind in enumerate(rows.kind):
-        if kind == CONSTRUCT:
-            rows.number[place] = rows.owner[place] = _constructed(rows, place)
-        elif kind == BAG:
-            rows.owner[place] = rows.number[place]
+    if CONSTRUCT in rows.kind or BAG in rows.kind:
+        for place, kind in enumerate(rows.kind):
+            if kind == CONSTRUCT:
+                rows.number[place] = rows.owner[place] = _constructed(rows, place)
+            elif kind == BAG:
+                rows.owner[place] = rows.number[place]
     anew = not run.matching.same_ids or run.without_zero_delays
     if anew or run.matching.renamed:  # names are hashed where entities are made
         for place, count in enumerate(rows.output_counts):

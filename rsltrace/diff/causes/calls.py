@@ -27,16 +27,17 @@ CALLS_MAX = 20
 EARLIER_MAX = 3
 _CALL_MAX = 60
 _ANSWERED = (NondeterminismSource.SOCKET, NondeterminismSource.PROCESS)
-_FOLDER = re.compile(r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)")
+# Patterns, compiled at their first use: few traces have such calls.
+_FOLDER = r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)"
 """The folder of an absolute path between quotes."""
 
 STARTED_BY = "subprocess.Popen("
 _STARTED = "started"
 _ANSWER_MAX = 60
-_CHANGED = re.compile(r"(\d+ bytes), changed \d+")
-_VARIABLE = re.compile(r"os\.environ\[(['\"])(.+)\1\]")
-_FILE = re.compile(r"\w[\w.]*\((?:PosixPath\()?(['\"])(?:[^'\"]*/)?([^'\"/]+)\1")
-_CONTENT = re.compile(r"(\d+ bytes), (SHA-256 [0-9a-f]+)")
+_CHANGED = r"(\d+ bytes), changed \d+"
+_VARIABLE = r"os\.environ\[(['\"])(.+)\1\]"
+_FILE = r"\w[\w.]*\((?:PosixPath\()?(['\"])(?:[^'\"]*/)?([^'\"/]+)\1"
+_CONTENT = r"(\d+ bytes), (SHA-256 [0-9a-f]+)"
 
 _Numbered = tuple[int, int, Finding]
 """A finding with its event, and its number among those of its run."""
@@ -139,7 +140,7 @@ def _paired(a: list[Finding], b: list[Finding]) -> list[CallDifference]:
     places: dict[tuple[str, str], tuple[list[_Numbered], list[_Numbered]]] = {}
     for side, findings in enumerate((a, b)):
         for number, finding in enumerate(findings):
-            place = (_FOLDER.sub(r"\1", finding.call), finding.stack)
+            place = (re.sub(_FOLDER, r"\1", finding.call), finding.stack)
             places.setdefault(place, ([], []))[side].append((finding.event, number, finding))
     calls = []
     for place, (of_a, of_b) in places.items():
@@ -170,7 +171,7 @@ def call_difference(
 ) -> CallDifference:
     """Return a call of both runs, or of one, with what distinguishes its answers."""
     a, b = answers
-    touched = [_CHANGED.fullmatch(value or "") for value in answers]
+    touched = [re.fullmatch(_CHANGED, value or "") for value in answers]
     return CallDifference(
         source,
         call,
@@ -188,17 +189,17 @@ def subject_of_call(source: str, call: str) -> str:
     """Return what a call asks for: ``MOTOR_SEED``, ``gains.yaml``; else the call."""
     found = None
     if source == NondeterminismSource.ENVIRONMENT.value:
-        found = _VARIABLE.match(call)
+        found = re.match(_VARIABLE, call)
     elif source in (NondeterminismSource.FILE.value, NondeterminismSource.DIRECTORY.value):
-        found = _FILE.match(call)
+        found = re.match(_FILE, call)
     return found[2] if found else call
 
 
 def _short(source: str, a: str, b: str) -> tuple[str, str]:
-    contents = _CONTENT.fullmatch(a), _CONTENT.fullmatch(b)
+    contents = re.fullmatch(_CONTENT, a), re.fullmatch(_CONTENT, b)
     if contents[0] and contents[1] and contents[0][1] == contents[1][1]:
         a, b = contents[0][2], contents[1][2]
-    sizes = _CHANGED.fullmatch(a), _CHANGED.fullmatch(b)
+    sizes = re.fullmatch(_CHANGED, a), re.fullmatch(_CHANGED, b)
     if sizes[0] and sizes[1] and sizes[0][1] != sizes[1][1]:
         a, b = sizes[0][1], sizes[1][1]
     if source == NondeterminismSource.ENVIRONMENT.value:

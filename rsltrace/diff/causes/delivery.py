@@ -24,7 +24,6 @@ from rsltrace.diff.facts.evidence import (
     EventSummary,
     MessageDifference,
 )
-from rsltrace.simulation.middleware.qos.policies import Qos, incompatible_policies
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.finding import EndlessWait, decode_waits
@@ -179,6 +178,8 @@ def _unmatched(
     keys: tuple[EntityKey, EntityKey], details: tuple[tuple[dict[str, object], ...], ...]
 ) -> tuple[bool, bool]:
     """Whether the QoS of two endpoints does not match in a, and in b."""
+    from rsltrace.simulation.middleware.qos.policies import Qos, incompatible_policies
+
     offered, requested = details if keys[0].kind == _PUBLISHER else details[::-1]
     in_a, in_b = (
         bool(incompatible_policies(*(Qos.from_summary(_qos(detail)) for detail in ends)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import zip_longest
@@ -192,6 +191,8 @@ def _is_reordered(message: MessageDifference) -> bool:
 
 def _is_as_recorded(run: ComparedTrace, file: Path) -> bool:
     try:
+        import hashlib  # OpenSSL takes long to load
+
         present = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
     except OSError:
         return False

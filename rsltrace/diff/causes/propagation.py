@@ -27,7 +27,7 @@ from rsltrace.diff.alignment.rows import (
 )
 from rsltrace.diff.causes.relevance import resolved_job
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
 CAUSE = "cause"
@@ -167,8 +167,7 @@ class Propagation:
     # -- one event -----------------------------------------------------------------------------
 
     def _take_item(self, item: EventPair) -> None:
-        rows, index = self._rows(item)
-        place = index - rows.first
+        rows, place = self._rows(item)
         if rows.stamp[place] != self._moment_stamp:
             self._end_moment()
             self._moment_stamp = rows.stamp[place]
@@ -189,7 +188,7 @@ class Propagation:
 
     def _take_alone(self, item: EventPair) -> None:
         """Take an item that differs and follows from nothing by its cause or its node."""
-        rows, index = self._rows(item)
+        rows, place = self._rows(item)
         previous: DivergenceOrigin | None = None
         if self._busy is None and self._moved_by(item):
             self._take_others_at(self._first_stamp(item))
@@ -198,7 +197,7 @@ class Propagation:
             self._consequence(item, why, previous)
         elif (shared := self._shared_root(item)) is not None:
             self._consequence(item, *shared)
-        elif rows.kind[index - rows.first] != SHUTDOWN and not self._is_unwinding(item):
+        elif rows.kind[place] != SHUTDOWN and not self._is_unwinding(item):
             self._spread(item, self._root(item).origin)  # when the run ends is said elsewhere
 
     def _take_others_at(self, stamp: int) -> None:
@@ -214,16 +213,16 @@ class Propagation:
         waiting."""
         a, b = self._block.rows_a, self._block.rows_b
         if item.a < 0 or item.b < 0:
-            rows, index = self._rows(item)
+            rows, place = self._rows(item)
             stuck = (b if item.b < 0 else a).run.trace
             if _failed(stuck) and not _failed(rows.run.trace) and self.found:
                 return STUCK, self.found[0].origin
-            if rows.kind[index - rows.first] not in (SUBSCRIPTION, ACTION):
+            if rows.kind[place] not in (SUBSCRIPTION, ACTION):
                 return None
             if self._busy is not None:
                 return BUSY, self._busy
             # A message that both sent: what else was sent on its topic took its place in the queue.
-            topic = rows.run.matching.keys[rows.number[index - rows.first]].name
+            topic = rows.run.matching.keys[rows.number[place]].name
             return (CAUSE, self._sent[topic]) if topic in self._sent else None
         i, j = item.a - a.first, item.b - b.first
         if a.stamp[i] != b.stamp[j]:
@@ -258,9 +257,12 @@ class Propagation:
             self.watched = FoundDivergence(origin, self._block.stamp(item), *self._places(item))
 
     def _rows(self, item: EventPair) -> tuple[EventColumns, int]:
+        """Return the run that has an item, a if both have, and its place in the columns."""
         if item.a >= 0:
-            return self._block.rows_a, item.a
-        return self._block.rows_b, item.b
+            rows = self._block.rows_a
+            return rows, item.a - rows.first
+        rows = self._block.rows_b
+        return rows, item.b - rows.first
 
     def _entities(self, items: list[EventPair]) -> frozenset[int]:
         rows = self._block.rows_a
@@ -333,20 +335,20 @@ class Propagation:
     def _explanation(self, item: EventPair) -> tuple[str | None, DivergenceOrigin | None]:
         """Return what an item follows from: ``cause`` or ``node``, and the origin of that."""
         a, b = self._block.rows_a, self._block.rows_b
-        rows, index = self._rows(item)
-        place = index - rows.first
-        by_node = self._owners.get(self._acting(rows, place))
+        i, j = item.a - a.first, item.b - b.first
+        caused = True
         if item.a >= 0 and item.b >= 0 and not item.inverted:
-            i, j = item.a - a.first, item.b - b.first
-            if a.input[i] == b.input[j] and a.stamp[i] == b.stamp[j]:
-                return (NODE, by_node) if by_node is not None else (None, None)
-        for side, origins, at in ((a, self._origins_a, item.a), (b, self._origins_b, item.b)):
-            if at < 0:
-                continue
-            cause = side.cause[at - side.first]
-            origin = origins.get(cause) if cause != NO_EVENT else None
-            if origin is not None and self._passes_on(origin, side, at, item):
-                return CAUSE, origin
+            caused = a.input[i] != b.input[j] or a.stamp[i] != b.stamp[j]
+        if caused:
+            if item.a >= 0:
+                origin = self._origins_a.get(a.cause[i])  # never NO_EVENT
+                if origin is not None and self._passes_on(origin, a, i, item):
+                    return CAUSE, origin
+            if item.b >= 0:
+                origin = self._origins_b.get(b.cause[j])
+                if origin is not None and self._passes_on(origin, b, j, item):
+                    return CAUSE, origin
+        by_node = self._owners.get(self._acting(a, i) if item.a >= 0 else self._acting(b, j))
         return (NODE, by_node) if by_node is not None else (None, None)
 
     def _acting(self, rows: EventColumns, place: int) -> int:
@@ -359,7 +361,7 @@ class Propagation:
         return matching.by_key.get(replace(key, ordinal=key.ordinal - 1), 0)
 
     def _passes_on(
-        self, origin: DivergenceOrigin, rows: EventColumns, at: int, item: EventPair
+        self, origin: DivergenceOrigin, rows: EventColumns, place: int, item: EventPair
     ) -> bool:
         """Whether the difference of a cause is one that the event it caused can have got.
 
@@ -369,34 +371,32 @@ class Propagation:
         if cause.a < 0 or cause.b < 0:
             return True
         a, b = self._block.rows_a, self._block.rows_b
-        if not a.first <= cause.a < a.end or not b.first <= cause.b < b.end:
+        i, j = cause.a - a.first, cause.b - b.first
+        if not 0 <= i < len(a.stamp) or not 0 <= j < len(b.stamp):
             return True  # of an earlier block: not looked at again
-        if a.stamp[cause.a - a.first] != b.stamp[cause.b - b.first]:
+        if a.stamp[i] != b.stamp[j] or (item.inverted and cause.inverted):
             return True
-        if item.inverted and cause.inverted:
+        mine = i if rows is a else j
+        nth = rows.cause_output[place]
+        if nth >= rows.output_counts[mine]:
             return True
-        mine, theirs = (cause.a, cause.b) if rows is a else (cause.b, cause.a)
-        nth = rows.cause_output[at - rows.first]
-        if nth >= rows.output_counts[mine - rows.first]:
-            return True
-        known = self._passed_on.get((mine, rows.run.of_b))
+        known = self._passed_on.get((mine, rows is a))
         if known is None:
-            other = b if rows is a else a
             drawn = {o[1] for o in self._different_outputs(cause) if o[0] == _DRAW}
-            known = drawn, {*places_beyond(rows.outputs(mine), other.outputs(theirs))}
-            self._passed_on[mine, rows.run.of_b] = known
-        drawn, alone = known
+            outputs, others = a.outputs(cause.a), b.outputs(cause.b)
+            alone = places_beyond(*((outputs, others) if rows is a else (others, outputs)))
+            known = self._passed_on[mine, rows is a] = drawn, {*alone}
+        drawn, alone_places = known
         # A delay is drawn for the receiver, an execution time for what ran.
-        if rows.number[at - rows.first] in drawn or rows.number[mine - rows.first] in drawn:
+        if drawn and (rows.number[place] in drawn or rows.number[mine] in drawn):
             return True
-        return nth in alone
+        return nth in alone_places
 
     # -- what follows ----------------------------------------------------------------------------
 
     def _spread(self, item: EventPair, origin: DivergenceOrigin) -> None:
         """Note what a differing event affects: its node, and the topics of what it sent."""
-        rows, index = self._rows(item)
-        place = index - rows.first
+        rows, place = self._rows(item)
         owner, matching = rows.owner[place], rows.run.matching
         if item.same:
             # Only reordered: its node notices only if it received two inputs in a different order.
@@ -407,7 +407,7 @@ class Propagation:
         outputs = self._different_outputs(item)
         nodes, keys = matching.nodes, matching.keys
         moved_ns = self._moved_by(item)
-        stamp = self._block.stamp(item) + min(moved_ns, 0)
+        stamp = rows.stamp[place] + min(moved_ns, 0)
         reached = self.found[origin.root].reached
         changes_owner = not outputs or item.a < 0 or item.b < 0
         takes_longer = self._workers_are_shared and self._waits_otherwise(item)
@@ -430,11 +430,11 @@ class Propagation:
         if takes_longer:
             self._busy = self._busy or origin
         if rows.kind[place] == CONSTRUCT:  # a program and the node that it makes are one
-            for kind, number, _, _ in rows.outputs(index):
+            for kind, number, _, _ in rows.outputs(rows.first + place):
                 if kind == _ENTITY and keys[number].kind in OF_THEIR_OWN:
                     self._taint(number, origin)
         if moved_ns:  # what both runs have was sent at another time
-            for kind, number, _, _ in beyond(rows.outputs(index), outputs):
+            for kind, number, _, _ in beyond(rows.outputs(rows.first + place), outputs):
                 if kind in REACHING:
                     _reach(reached, number, stamp, moved_ns)
 

@@ -25,8 +25,9 @@ _WITH = "#   with --"
 _LAUNCH = "launch.+="
 _ROS = "ros_arguments.+="
 
-_JOB_NAME = re.compile(r"\w[\w .+-]{0,200}\.(?:ya?ml|json)")
-_LAUNCH_NAME = re.compile(r"\w[\w .+-]{0,200}\.(?:ya?ml|xml|py)")
+# Patterns, compiled at their first use: few traces come to it.
+_JOB_NAME = r"\w[\w .+-]{0,200}\.(?:ya?ml|json)"
+_LAUNCH_NAME = r"\w[\w .+-]{0,200}\.(?:ya?ml|xml|py)"
 _FILE_BYTES_MAX = 4 << 20
 _TEXT_MAX = 200
 _CHANGE_MAX = 1000
@@ -58,9 +59,9 @@ _SETTINGS = (
 """Keys that ``--set`` is offered for, and their values: nothing here names code or a file. Few
 traces have such settings, and compiling the patterns takes milliseconds."""
 
-_ARGUMENT = re.compile(rf"({_KEY}):=({_NUMBER}|{_NAME})", re.ASCII)
-_REMAPPING = re.compile(r"[\w/~:]+:=[\w/~]+", re.ASCII)
-_PARAMETER = re.compile(rf"[\w/~.:]+:=(?:{_NUMBER})", re.ASCII)
+_ARGUMENT = rf"({_KEY}):=({_NUMBER}|{_NAME})"
+_REMAPPING = r"[\w/~:]+:=[\w/~]+"
+_PARAMETER = rf"[\w/~.:]+:=(?:{_NUMBER})"
 _ROS_OPTIONS = {"-r": _REMAPPING, "--remap": _REMAPPING, "-p": _PARAMETER, "--param": _PARAMETER}
 
 
@@ -143,7 +144,7 @@ def job_file(trace: Trace, name: str) -> tuple[str, bool]:
 
     A trace knows its name, and often lies beside it.
     """
-    if not _JOB_NAME.fullmatch(name):
+    if not re.fullmatch(_JOB_NAME, name):
         return "", False
     places = (Path(name), Path(trace.name).parent / name)
     found = [place for place in places if _is_file(place)]
@@ -196,7 +197,7 @@ def _take_launch_file(words: _Words, spec: str, name: str) -> None:
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError):
         words.foreign.append(f"--set {_LAUNCH}{spec}")  # written by hand
         return
-    fits = all(_ARGUMENT.fullmatch(argument) for argument in arguments)
+    fits = all(re.fullmatch(_ARGUMENT, argument, re.ASCII) for argument in arguments)
     if words.launch or not fits or not _is_below_here(file):
         words.foreign.append(f"--launch {file} {' '.join(arguments)}".rstrip())
         return
@@ -209,7 +210,7 @@ def _take_launch_file(words: _Words, spec: str, name: str) -> None:
 def _is_below_here(file: str) -> bool:
     """Whether a path leads to a file in the working directory or below, and is written so."""
     path = Path(file)
-    if path.is_absolute() or ".." in path.parts or not _LAUNCH_NAME.fullmatch(path.name):
+    if path.is_absolute() or ".." in path.parts or not re.fullmatch(_LAUNCH_NAME, path.name):
         return False
     if len(file) > _TEXT_MAX or file.startswith("-") or not file.isprintable():
         return False
@@ -224,7 +225,7 @@ def _take_ros_argument(words: _Words, text: str) -> None:
         word = None
     before = words.ros[-1] if len(words.ros) % 2 else ""
     fits = isinstance(word, str) and (
-        bool(_ROS_OPTIONS[before].fullmatch(word)) if before else word in _ROS_OPTIONS
+        bool(re.fullmatch(_ROS_OPTIONS[before], word, re.ASCII)) if before else word in _ROS_OPTIONS
     )
     if fits:
         words.ros.append(word)

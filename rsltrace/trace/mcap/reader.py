@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import field
-from functools import cached_property
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
@@ -26,7 +25,6 @@ from rsltrace.trace.mcap.records import (
     RecordFields,
     RecordSpan,
     TruncatedFile,
-    channels_of_chunk_index,
     parse_channel,
     parse_chunk_index,
     parse_header,
@@ -197,19 +195,6 @@ class McapSummary:
     def chunks(self) -> Iterator[ChunkIndexEntry]:
         """Yield the chunks. Raises DamageError."""
         yield from map(parse_chunk_index, self._chunk_indexes)
-
-    def chunk_indexes(self, channels: frozenset[int]) -> Iterator[bytes]:
-        """Yield what is said of the chunks with messages of some channels, not parsed. Raises
-        DamageError."""
-        if channels:
-            for body, held in zip(self._chunk_indexes, self._held, strict=True):
-                if not channels.isdisjoint(held):
-                    yield body
-
-    @cached_property
-    def _held(self) -> list[list[int]]:
-        """The channels of each chunk. A large trace has thousands, and few are looked for often."""
-        return list(map(channels_of_chunk_index, self._chunk_indexes))
 
 
 def has_end(source: ByteSource) -> bool:

@@ -210,7 +210,7 @@ class ChunkIndexEntry(NamedTuple):
     start_ns: int
     end_ns: int
     span: RecordSpan
-    indexes: list[tuple[int, int]]
+    indexes: dict[int, int]
     end: int
 
 
@@ -246,18 +246,9 @@ def parse_chunk_index(body: bytes) -> ChunkIndexEntry:
     entries_end = _CHUNK_INDEX_HEAD.size + size
     if size % _CHANNEL_NUMBER.size or entries_end + _U64.size > len(body):
         raise DamageError("an entry of the list of chunks is cut off")
-    indexes = list(_CHANNEL_NUMBER.iter_unpack(body[_CHUNK_INDEX_HEAD.size : entries_end]))
+    indexes = dict(_CHANNEL_NUMBER.iter_unpack(body[_CHUNK_INDEX_HEAD.size : entries_end]))
     end = offset + length + _U64.unpack_from(body, entries_end)[0]
     return ChunkIndexEntry(start_ns, end_ns, RecordSpan(offset, length), indexes, end)
-
-
-def channels_of_chunk_index(body: bytes) -> list[int]:
-    """Return only the channels of a ChunkIndex: of thousands few are needed."""
-    if len(body) > _CHUNK_INDEX_HEAD.size + _CHANNEL_NUMBER.size:
-        (size,) = _U32.unpack_from(body, _CHUNK_INDEX_HEAD.size - _U32.size)
-        if size == _CHANNEL_NUMBER.size:  # events or outputs: most chunks
-            return [_U16.unpack_from(body, _CHUNK_INDEX_HEAD.size)[0]]
-    return [channel_id for channel_id, _ in parse_chunk_index(body).indexes]
 
 
 def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.texts import format_duration
 
 

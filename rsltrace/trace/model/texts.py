@@ -98,10 +98,9 @@ PLACEHOLDERS = frozenset((NO_FIELD, "__msgtype__"))
 """Also the field in which rosbags' classes keep the type's name."""
 
 
-_NOT_PRINTABLE = re.compile(
-    r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
-)
-_NOT_IN_LINES = re.compile(f"(?![\n\t]){_NOT_PRINTABLE.pattern}")
+# Texts, which ``re`` compiles at their first use: hardly any text needs it.
+_NOT_PRINTABLE = r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
+_NOT_IN_LINES = f"(?![\n\t]){_NOT_PRINTABLE}"
 _SHORT = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
 
 
@@ -110,12 +109,12 @@ def printable(text: str) -> str:
 
     Names and log texts come from the trace, and a trace may come from anybody.
     """
-    return _NOT_PRINTABLE.sub(_escaped, text)
+    return text if text.isprintable() else re.sub(_NOT_PRINTABLE, _escaped, text)
 
 
 def printable_lines(text: str) -> str:
     """Return ``text`` with control characters escaped, except line breaks and tabs."""
-    return _NOT_IN_LINES.sub(_escaped, text)
+    return text if text.isprintable() else re.sub(_NOT_IN_LINES, _escaped, text)
 
 
 def shortened(text: str, width: int) -> str:

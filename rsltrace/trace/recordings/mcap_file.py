@@ -283,7 +283,7 @@ def _add_ranges(
             raise DamageError(f"a chunk at byte {chunk.span.offset} lies outside the data")
         if not scan_records(source, at, chunk.span.offset, index, skip_chunks=True):
             return False
-        channels = frozenset(channel for channel, _ in chunk.indexes) or None
+        channels = frozenset(chunk.indexes) or None
         index.parts.append(RecordRange(chunk.span, chunk.start_ns, chunk.end_ns, channels, True))
         at = chunk.end
     if at > data_end:
