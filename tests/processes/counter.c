@@ -1,8 +1,10 @@
 // A node on rcl alone: a timer counts, and what comes in on /echo goes out on /heard.
 //
 // Usage: counter [period in ms] [when to leave, or what to do at the fifth count: crash, exit, …]
-// With "address" it publishes where its timer lies instead. It counts from the number in COUNT_FROM, and from that in the file "more" in its folder. With
+// Instead it publishes with "address" where its timer lies, with "heap" where new memory lies after a
+// draw, with "heaps" from how many heaps two threads, one after the other, got memory. It counts from the number in COUNT_FROM, and from that in the file "more" in its folder. With
 // NAMED there is another node, and callbacks are told to tracetools as rclcpp does it.
+#include <pthread.h>
 #include <rcl/error_handling.h>
 #include <rcl/rcl.h>
 #include <signal.h>
@@ -25,12 +27,53 @@ static const char *action = "";
 static rcl_publisher_t count_publisher;
 static uint64_t counted = 0;
 
+static pthread_key_t slow_key;
+
+// What libc calls last at the end of a thread, for longer than another takes to begin.
+static void end_slowly(void *rounds) {
+  if (rounds != (void *)1) {
+    pthread_setspecific(slow_key, (char *)rounds - 1);
+    return;
+  }
+  for (volatile int i = 0; i < 50000000; i++) {
+  }
+}
+
+static void *heap_of_thread(void *heap) {
+  void *memory = malloc(100);
+  *(uintptr_t *)heap = (uintptr_t)memory >> 26;  // libc's heaps begin at multiples of 64 MiB
+  free(memory);
+  pthread_setspecific(slow_key, (void *)4);
+  return NULL;
+}
+
+static uint64_t heaps_of_threads(void) {
+  pthread_t threads[2];
+  uintptr_t heaps[2];
+  pthread_key_create(&slow_key, end_slowly);
+  for (int i = 0; i < 2; i++) pthread_create(&threads[i], NULL, heap_of_thread, &heaps[i]);
+  for (int i = 0; i < 2; i++) pthread_join(threads[i], NULL);
+  pthread_key_delete(slow_key);
+  return heaps[0] == heaps[1] ? 1 : 2;
+}
+
+static uint64_t heap_after_draw(void) {
+  srand(1);
+  rand();
+  void *memory = malloc(100);
+  const uint64_t where = (uintptr_t)memory;
+  free(memory);
+  return where;
+}
+
 static void on_timer(rcl_timer_t *timer, int64_t since_last) {
   (void)since_last;
   std_msgs__msg__UInt64 message;
   std_msgs__msg__UInt64__init(&message);
   message.data = ++counted;
   if (strcmp(action, "address") == 0) message.data = (uint64_t)(uintptr_t)timer;
+  if (strcmp(action, "heap") == 0) message.data = heap_after_draw();
+  if (strcmp(action, "heaps") == 0) message.data = heaps_of_threads();
   // As rclcpp does with use_intra_process_comms: "both" if somebody outside of the process listens.
   if (strcmp(action, "intra") == 0 || strcmp(action, "both") == 0)
     ros_trace_rclcpp_intra_publish(&count_publisher, &message);

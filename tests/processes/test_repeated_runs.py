@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.adapters.processes import child
+from rsltrace.adapters.workspace import cache
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.model.entity import EntityKind
@@ -121,8 +122,41 @@ def test_where_the_stack_lies_does_not_depend_on_the_size_of_the_surroundings(
         (tmp_path / "job.yaml").write_text(
             json.dumps({"nodes": [entry], "stop": {"duration": "1s"}})
         )
-        path = tmp_path / f"{i}.mcap"
-        assert run(load_job(tmp_path / "job.yaml"), path).error is None
-        with Trace.open(path) as trace:
-            found |= {trace.decode("/count", data).data for _, _, data in trace.messages("/count")}  # type: ignore[attr-defined]
+        found |= _counts(tmp_path, f"{i}.mcap")
     assert len(found) == 1
+
+
+def _counts(folder: Path, name: str) -> set[int]:
+    """Run a job, and return what ``counter`` published."""
+    assert run(load_job(folder / "job.yaml"), folder / name).error is None
+    with Trace.open(folder / name) as trace:
+        return {trace.decode("/count", data).data for _, _, data in trace.messages("/count")}  # type: ignore[attr-defined]
+
+
+def test_where_memory_lies_does_not_depend_on_the_folder_for_caches(
+    compiled: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The library that processes are started with lies there: another user's has another path."""
+    (tmp_path / "job.yaml").write_text(
+        f"nodes: [{{program: {compiled('counter.c')}, arguments: ['100', heap]}}]\n"
+        "stop: {duration: 250ms}\n"
+    )
+    root = cache._root()
+    found = [_counts(tmp_path, "here.mcap")]
+    (tmp_path / "u" / ("s" * 100)).mkdir(parents=True)
+    for name in ("a", "b" * 20, "u/" + "s" * 100 + "/er"):
+        (tmp_path / name).symlink_to(root)
+        monkeypatch.setattr(cache, "_root", lambda place=tmp_path / name: place)
+        found.append(_counts(tmp_path, f"{len(found)}.mcap"))
+    assert all(one == found[0] for one in found)
+
+
+def test_a_thread_begins_when_the_one_before_it_has_given_back_its_heap(
+    compiled: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """Else chance says which heap it gets, and so the order of all that goes by addresses."""
+    (tmp_path / "job.yaml").write_text(
+        f"nodes: [{{program: {compiled('counter.c')}, arguments: ['100', heaps]}}]\n"
+        "stop: {duration: 250ms}\n"
+    )
+    assert _counts(tmp_path, "run.mcap") == {1}

@@ -36,6 +36,7 @@ bool is_library(const Dl_info &info) {
   return false;
 }
 
+// Of libraries no more is kept: how long the path of ours is must not show in the heap.
 struct Caller {
   bool own = false;
   std::string file;
@@ -50,7 +51,7 @@ Caller &caller_at(const void *address) {
   Dl_info info{};
   if (!is_new || dladdr(address, &info) == 0 || info.dli_fname == nullptr) return found->second;
   const auto offset = static_cast<const char *>(address) - 1 - static_cast<char *>(info.dli_fbase);
-  found->second = {!is_library(info), info.dli_fname, static_cast<std::uint64_t>(offset)};
+  if (!is_library(info)) found->second = {true, info.dli_fname, static_cast<std::uint64_t>(offset)};
   return found->second;
 }
 

@@ -35,7 +35,7 @@ bool has_other_end(int descriptor, const std::string &pipe) {
 bool is_pair_of_ours(int descriptor) {
   ucred peer{};
   socklen_t length = sizeof peer;
-  return getsockopt(descriptor, SOL_SOCKET, SO_PEERCRED, &peer, &length) == 0 && peer.pid == getpid();
+  return getsockopt(descriptor, SOL_SOCKET, SO_PEERCRED, &peer, &length) == 0 && peer.pid == REAL(getpid)();
 }
 
 bool any_outside(int epoll, std::string &where) {

@@ -8,12 +8,14 @@
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/prctl.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
 
 #include <algorithm>
+#include <string_view>
 
 #include "endpoints.h"
 #include "entropy.h"
@@ -114,24 +116,24 @@ void forked() {
   told.forget();
 }
 
-// What this process starts itself is no part of the run.
+// What this process starts itself is no part of the run. In place: what the heap was asked for here
+// would depend on where the library lies, and so would the addresses of all that follows.
 void forget_environment() {
   unsetenv("RSLTRACE_LINK");
-  const char *preload = getenv("LD_PRELOAD");
-  std::string kept;
-  for (std::string rest = preload == nullptr ? "" : preload; !rest.empty();) {
-    const auto end = rest.find(':');
-    const std::string name = rest.substr(0, end);
-    rest = end == std::string::npos ? "" : rest.substr(end + 1);
-    const std::string file = name.substr(name.rfind('/') + 1);
+  char *const preload = getenv("LD_PRELOAD");
+  if (preload == nullptr) return;
+  char *kept = preload;
+  for (const char *rest = preload; *rest != '\0';) {
+    const std::string_view name(rest, strcspn(rest, ":"));
+    rest += name.size() + (rest[name.size()] == ':');
+    const auto file = name.substr(name.rfind('/') + 1);
     if (file.rfind("librmw_rsltrace", 0) == 0 || file.rfind("librsltrace_", 0) == 0) continue;
-    kept += (kept.empty() ? "" : ":") + name;
+    if (kept != preload) *kept++ = ':';
+    memmove(kept, name.data(), name.size());
+    kept += name.size();
   }
-  if (kept.empty()) {
-    unsetenv("LD_PRELOAD");
-  } else {
-    setenv("LD_PRELOAD", kept.c_str(), 1);
-  }
+  *kept = '\0';
+  if (kept == preload) unsetenv("LD_PRELOAD");
 }
 
 // Out of the way: the numbers that the program's own descriptors get must not depend on those that

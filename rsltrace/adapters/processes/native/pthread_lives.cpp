@@ -173,7 +173,7 @@ RSLTRACE_EXPORT int pthread_kill(pthread_t handle, int signal) noexcept {
 
 RSLTRACE_EXPORT int kill(pid_t pid, int signal) noexcept {
   Thread *thread = me();
-  if (thread == nullptr || signal == 0 || pid != getpid() || thread->number == 0)
+  if (thread == nullptr || signal == 0 || pid != REAL(getpid)() || thread->number == 0)
     return REAL(kill)(pid, signal);
   Inside inside(*thread);
   Thread *main = owner(pid);

@@ -1,5 +1,4 @@
 // Wait sets of rcl, with their timers: rmw_wait would only be told the shortest timeout.
-#include <dlfcn.h>
 #include <rcl/client.h>
 #include <rcl/error_handling.h>
 #include <rcl/event.h>
@@ -11,6 +10,7 @@
 #include <algorithm>
 
 #include "executor_order.h"
+#include "real.h"
 #include "ros_clocks.h"
 #include "timers.h"
 #include "waiting.h"
@@ -166,9 +166,8 @@ void keep_only(Item **items, std::size_t size, const std::vector<std::size_t> &p
 // With the one that was found all that are triggered, for rclpy: it looks at them in the order of
 // their creation. (rclcpp goes by addresses, and gets one at a time, unless it only looks.)
 void keep_triggered(Kept &kept, const Wanted &wanted) {
-  static const bool takes_all = dlsym(RTLD_DEFAULT, "Py_IsInitialized") != nullptr;
   for (const auto &one : wanted.conditions) {
-    if (!takes_all || one.place == NONE || !one.condition->is_triggered) continue;
+    if (!has_python() || one.place == NONE || !one.condition->is_triggered) continue;
     one.condition->is_triggered = false;
     kept.conditions.push_back(one.place);
   }

@@ -5,6 +5,8 @@ namespace rsltrace {
 
 // The next definition of `name` after this library's, or null if this libc has none.
 void *real(const char *name);
+// Whether the program has a Python.
+bool has_python();
 
 // Looked up when the library is loaded, or by who calls it before that. Not later: a thread that
 // looks it up would wait for dlopen, whose constructors may wait for that thread.

@@ -85,10 +85,10 @@ void make_ready(Thread &thread) {
 }
 
 // Until the thread that ended has left libc's code too: what it gives back (stack, arena) is then
-// there for the next in every run.
+// there for the next in every run. Before that, nothing may ask for memory.
 void wait_until_gone() {
   if (ended.tid == 0) return;
-  const pid_t pid = getpid();
+  const pid_t pid = REAL(getpid)();
   for (int tries = 0; ended.tid != pid && REAL(syscall)(SYS_tgkill, pid, ended.tid, 0) == 0; ++tries) {
     timespec pause{0, 20'000};
     if (tries < 50)
@@ -105,7 +105,7 @@ void carry_out(Thread &thread, Order what) {
   switch (what) {
     case Order::TELL: note_frames(thread); break;
     case Order::RAISE: REAL(pthread_kill)(pthread_self(), thread.signal); break;
-    case Order::KILL: REAL(kill)(getpid(), thread.signal); break;
+    case Order::KILL: REAL(kill)(REAL(getpid)(), thread.signal); break;
     case Order::NONE:
     case Order::GO: break;
   }
@@ -189,7 +189,7 @@ Thread &choose() {
 
 void adopt_main(Thread &thread) {
   if (table == nullptr) set_up();
-  thread.tid = getpid();
+  thread.tid = REAL(getpid)();
   thread.handle = pthread_self();
   thread.state = State::RUNNING;
   table->threads.push_back(&thread);
@@ -224,7 +224,7 @@ Thread *enter() {
   if (!linked()) return nullptr;
   Thread *thread = self;
   if (thread == nullptr) {
-    if (REAL(syscall)(SYS_gettid) == getpid())
+    if (REAL(syscall)(SYS_gettid) == REAL(getpid)())
       adopt_main(main_thread);
     else if (table != nullptr)
       adopt_stranger();
@@ -458,9 +458,9 @@ int bell_fd() { return table->bell; }
 
 void raise_in_main(int signal) {
   if (self == &main_thread)
-    REAL(kill)(getpid(), signal);
+    REAL(kill)(REAL(getpid)(), signal);
   else if (!order(main_thread, Order::KILL, signal))
-    REAL(kill)(getpid(), signal);
+    REAL(kill)(REAL(getpid)(), signal);
   ring();
 }
 

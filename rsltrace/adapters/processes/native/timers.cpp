@@ -1,12 +1,12 @@
 #include "timers.h"
 
-#include <dlfcn.h>
 #include <rcl/time.h>
 
 #include <unordered_map>
 
 #include "endpoints.h"
 #include "guard_conditions.h"
+#include "real.h"
 #include "waiting.h"
 
 namespace rsltrace {
@@ -58,8 +58,7 @@ std::int64_t deadline_of(const Timer &timer) {
 
 // rclpy's executors make timers of their own for waits with a time, with clocks that are no node's.
 bool may_be_an_executors(const rcl_clock_t &clock) {
-  static const bool has_python = dlsym(RTLD_DEFAULT, "Py_IsInitialized") != nullptr;
-  return has_python && clock.type != RCL_ROS_TIME;
+  return has_python() && clock.type != RCL_ROS_TIME;
 }
 
 void made(const rcl_timer_t *handle, rcl_clock_t *clock, std::int64_t period_ns) {

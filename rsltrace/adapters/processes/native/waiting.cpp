@@ -1,6 +1,6 @@
 #include "waiting.h"
+#include "real.h"
 
-#include <dlfcn.h>
 #include <rmw/rmw.h>
 
 #include <algorithm>
@@ -207,8 +207,7 @@ std::vector<Found> wait_for(const Wanted &wanted, std::int64_t timeout_ns, const
   }
   std::vector<Found> found = {wait_for_one(wanted, timeout_ns, what)};
   // rclpy finds what a guard condition has kept it from in its next wait, which it begins at once.
-  static const bool has_python = dlsym(RTLD_DEFAULT, "Py_IsInitialized") != nullptr;
-  if (timeout_ns > 0 && found[0].kind == Found::Kind::CONDITION && !has_python) {
+  if (timeout_ns > 0 && found[0].kind == Found::Kind::CONDITION && !has_python()) {
     const std::vector<Found> there = ready_there(wanted);
     if (!there.empty()) found.push_back(without_its_turn(wanted, there[0]));
   }
