@@ -171,3 +171,12 @@ def test_a_recursion_ends(package: SourcePackage) -> None:
         "include(CMakeLists.txt)\nadd_subdirectory(.)\nmacro(m)\n m()\n m()\nendmacro()\nm()"
     )
     assert commands(package) == []
+
+
+def test_a_value_is_not_expanded_again(package: SourcePackage) -> None:
+    """One that refers to itself would grow by powers of ten, as those of rclcpp's flags do."""
+    more = 'set(FLAGS "${FLAGS} -a")\n' * 12
+    text = f"{more}set(one FLAGS)\ncalled(${{${{one}}}})\ncalled(${{a_${{FLAGS}})"
+    (package.folder / "CMakeLists.txt").write_text(text)
+    flags = "${FLAGS}" + " -a" * 12
+    assert [one.words for one in commands(package)] == [(flags,), (f"${{a_{flags}",)]

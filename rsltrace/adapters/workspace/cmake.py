@@ -31,7 +31,7 @@ _TOKEN = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 _COMMAND = re.compile(r"([A-Za-z_]\w*)[ \t\n]*\(")
-_REFERENCE = re.compile(r"\$\{([A-Za-z0-9_./+-]*)\}")
+_BRACES = re.compile(r"(\\.|\$\w*\{|\})", re.DOTALL)
 _UNKNOWN = re.compile(r"\$(?:ENV)?\{[^}]*\}?|\$<")
 _FALSE = frozenset(("", "0", "OFF", "NO", "FALSE", "N", "IGNORE", "NOTFOUND"))
 _TRUE = frozenset(("1", "ON", "YES", "TRUE", "Y"))
@@ -451,19 +451,24 @@ class _CMakeInterpreter:
         return found
 
     def _filled(self, text: str) -> str:
-        """Replace what is known, inner references first; the rest stays as it is."""
-        for _ in range(10):
-            filled = _REFERENCE.sub(self._value_of, text)
-            if filled == text:
-                break
-            text = filled
-        return text
+        """Replace what is known, inner references first; the rest stays as it is.
 
-    def _value_of(self, reference: re.Match[str]) -> str:
-        if reference.start() and reference.string[reference.start() - 1] == "\\":
-            return reference[0]
-        value = self._scope.get(reference[1])
-        return reference[0] if value is None else value
+        A value is not expanded again: one that holds a reference to itself (``set(X "${X} a")``
+        with an X that nobody here has set) would grow with each use.
+        """
+        opened: list[str] = []
+        parts = [""]
+        for token in _BRACES.split(text):
+            if token[:1] == "$" and token[-1:] == "{":
+                opened.append(token)
+                parts.append("")
+            elif token == "}" and opened:
+                name, opening = parts.pop(), opened.pop()
+                value = self._scope.get(name) if opening == "${" else None
+                parts[-1] += f"{opening}{name}}}" if value is None else value
+            else:
+                parts[-1] += token
+        return parts[0] + "".join(map("".join, zip(opened, parts[1:], strict=True)))
 
     # -- conditions ------------------------------------------------------------------------------
 
