@@ -133,18 +133,20 @@ def _counts(folder: Path, name: str) -> set[int]:
         return {trace.decode("/count", data).data for _, _, data in trace.messages("/count")}  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize("what", ["heap", "thread"])
 def test_where_memory_lies_does_not_depend_on_the_folder_for_caches(
-    compiled: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    compiled: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """The library that processes are started with lies there: another user's has another path."""
     (tmp_path / "job.yaml").write_text(
-        f"nodes: [{{program: {compiled('counter.c')}, arguments: ['100', heap]}}]\n"
+        f"nodes: [{{program: {compiled('counter.c')}, arguments: ['100', {what}]}}]\n"
         "stop: {duration: 250ms}\n"
     )
     root = cache._root()
     found = [_counts(tmp_path, "here.mcap")]
-    (tmp_path / "u" / ("s" * 100)).mkdir(parents=True)
-    for name in ("a", "b" * 20, "u/" + "s" * 100 + "/er"):
+    names = ["a", "b" * 20, "u" * 100 + "/er", "u" * 100 + "/" + "s" * 200]
+    (tmp_path / names[-1]).parent.mkdir(parents=True)
+    for name in names:
         (tmp_path / name).symlink_to(root)
         monkeypatch.setattr(cache, "_root", lambda place=tmp_path / name: place)
         found.append(_counts(tmp_path, f"{len(found)}.mcap"))

@@ -261,6 +261,7 @@ _ELF = b"\x7fELF"
 _ELF_HEAD = struct.Struct("<32xQ14xHH6x")
 """Of its 64 bytes: where the program headers are, their size and number."""
 _PT_INTERP = struct.pack("<I", 3)
+_PATH_BYTES = 512
 _UNBUFFERED = "PYTHONUNBUFFERED"
 
 
@@ -345,7 +346,9 @@ def program(
         is_native = b"libpython" not in file.read() and is_compiled(path)
     libraries = [str(place) for place in library.ros.libraries]
     around = {**surroundings, _UNBUFFERED: "1", **environment}
-    around["LD_PRELOAD"] = os.pathsep.join([str(library.path), *_listed(around, "LD_PRELOAD")])
+    # The loader keeps the path before all else is in memory: its length would show in addresses.
+    preloaded = str(library.path).rjust(_PATH_BYTES, "/")
+    around["LD_PRELOAD"] = os.pathsep.join([preloaded, *_listed(around, "LD_PRELOAD")])
     if search_path:
         around["PYTHONPATH"] = os.pathsep.join([*search_path, *_listed(around, "PYTHONPATH")])
     if prefixes:  # what is built comes first
