@@ -519,7 +519,7 @@ def test_a_callback_that_sends_thousands_of_messages_is_compared_once(tmp_path: 
         Simulation(replace(plan, seed=seed), tmp_path / f"{name}.mcap").run()
     begin = time.process_time()
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    assert time.process_time() - begin < 15
+    assert time.process_time() - begin < 5
     assert len(diff.divergences) == 1
     (reach,) = diff.divergences[0].reaches
     assert (reach.topic, reach.events) == ("/out", 4000)

@@ -462,7 +462,7 @@ def test_of_many_topics_as_many_are_shown_as_two_lines_hold(width: int, shown: i
     )
     begin = time.process_time()
     text = render(diff, "text", width=width)
-    assert time.process_time() - begin < 20
+    assert time.process_time() - begin < 2
     affects = " ".join(text[text.index("affects /t0") :].split())
     assert affects.count(" immediately, ", 0, affects.index("more")) == shown
     assert f" immediately, and {5000 - shown} more" in affects

@@ -10,9 +10,6 @@ from rsltrace.errors import JobError
 from rsltrace.job.reading.yaml_source import REPEATED_MAX, parse_yaml
 from rsltrace.trace.model.operation import NESTING_MAX
 
-CPU_S = 20.0
-"""More than a busy machine takes to refuse any; to read one would take hours, or all memory."""
-
 
 @pytest.mark.parametrize(
     "text", ["[" * 5000 + "]" * 5000, "{a: " * 5000 + "}" * 5000, "[" * 1_000_000, "[{" * 50_000]
@@ -21,7 +18,7 @@ def test_brackets_without_end_are_refused_at_once(text: str) -> None:
     begin = time.process_time()
     with pytest.raises(JobError, match=r"job\.yaml:2: brackets are nested more than 100 deep"):
         parse_yaml(f"seed: 1\nnodes: {text}", "job.yaml")
-    assert time.process_time() - begin < CPU_S
+    assert time.process_time() - begin < 1
 
 
 def test_what_is_closed_again_is_not_nested() -> None:
@@ -51,7 +48,7 @@ def test_aliases_without_end_are_refused_at_once(kind: str, shape: tuple[int, in
     begin = time.process_time()
     with pytest.raises(JobError, match=r"job\.yaml:\d+:\d+: aliases and '<<' repeat more than"):
         parse_yaml(_laughs(kind, *shape), "job.yaml")
-    assert time.process_time() - begin < CPU_S
+    assert time.process_time() - begin < 1
 
 
 def test_aliases_within_reason_are_followed() -> None:

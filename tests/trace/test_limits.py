@@ -103,7 +103,7 @@ def test_a_schema_of_many_strings_is_refused_at_once() -> None:
     begin = time.process_time()
     with pytest.raises(TraceError, match="2048000 strings or messages"):
         Decoder(ChannelInfo(1, "/t", "x/msg/T", "ros2msg", text, {}))
-    assert time.process_time() - begin < 20
+    assert time.process_time() - begin < 5
 
 
 def test_schemas_have_a_limit_together(monkeypatch: pytest.MonkeyPatch) -> None:
