@@ -255,6 +255,27 @@ def _version_in(folder: str, name: str) -> Iterator[str]:
             yield from (value.strip() for key, _, value in lines if key.lower() == "version")
 
 
+def _python_options() -> str:
+    """Return the options of Python that change what programs do, "" if there are none."""
+    flags = sys.flags
+    found = {
+        f"-O{flags.optimize}": flags.optimize,
+        "-b": flags.bytes_warning,
+        "-X dev": flags.dev_mode,
+        "-X utf8": flags.utf8_mode,
+        "-X no_debug_ranges": "no_debug_ranges" in sys._xoptions,
+        f"-X int_max_str_digits={sys.get_int_max_str_digits()}": (
+            sys.get_int_max_str_digits() != sys.int_info.default_max_str_digits
+        ),
+    }
+    found.update(
+        (f"-W error::{kind.__name__}", True)
+        for action, _, kind, *_ in warnings.filters
+        if action == "error"
+    )
+    return " ".join(option for option, is_set in found.items() if is_set)
+
+
 def environment(job: Job | None = None) -> dict[str, str]:
     """Return what a run's result may depend on: versions, never dates, names or paths.
 
@@ -268,6 +289,8 @@ def environment(job: Job | None = None) -> dict[str, str]:
         "system": platform.system(),
         "hash_seed": os.environ.get(HASH_SEED, "random"),
     }
+    if options := _python_options():
+        values["python_options"] = options
     values.update(_versions())
     kernels = "" if job is None else numerical_libraries(job)
     if kernels:

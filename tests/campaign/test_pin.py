@@ -52,6 +52,40 @@ def test_the_process_is_pinned_whatever_was_set(
         assert "numerics" not in trace.environment, "no module of the job uses numbers"
 
 
+PYTHON = {
+    "PYTHONOPTIMIZE": "2",
+    "PYTHONWARNINGS": "error::UserWarning",
+    "PYTHONINTMAXSTRDIGITS": "640",
+    "PYTHONDEVMODE": "1",
+    "PYTHONASYNCIODEBUG": "1",
+    "PYTHONNODEBUGRANGES": "1",
+    "PYTHONUTF8": "1",
+    "PYTHONIOENCODING": "latin-1",
+}
+
+
+def test_no_option_of_python_changes_what_nodes_do(
+    rsltrace: Callable[..., Any], job: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = job(
+        "import warnings; assert warnings.warn('x') is None; "
+        "log(f'{__debug__} {sys.flags} {sys.get_int_max_str_digits()} {sys.stdout.encoding}')"
+    )
+    options = []
+    digests = set()
+    for environment, words in (({}, ()), (PYTHON, ()), (PYTHON, ("--no-pin",))):
+        done = rsltrace(
+            "record", path, "-o", "run.mcap", "--force", *words, env={**os.environ, **environment}
+        )
+        digests.add(done.stdout.split()[1])
+        with Trace.open(tmp_path / "run.mcap") as trace:
+            options.append(trace.environment.get("python_options"))
+    assert len(digests) == 2, "pinned, it is the same"
+    assert options[:2] == [None, None]
+    assert "-O2 -X dev" in options[2]
+    assert "-W error::UserWarning" in options[2]
+
+
 def test_libraries_are_looked_for_in_one_order(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[Mapping[str, str]] = []
     monkeypatch.setattr(pin, "_before", "")
