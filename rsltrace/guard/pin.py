@@ -2,7 +2,8 @@
 
 ``pin`` starts the same command again in this process: with a fixed hash seed, without address-space
 randomization (where the kernel allows it), in UTC and C.UTF-8, without Python's own options, with
-one thread per numerical library and sorted library folders. It costs one start of Python. ``unpin`` goes back.
+one thread per numerical library and sorted library folders. It costs one start of Python.
+``unpin`` goes back.
 """
 
 from __future__ import annotations

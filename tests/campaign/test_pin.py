@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import rsltrace.guard.pin as pin
+from rsltrace.diff.causes.relevance import environment_settings
 from rsltrace.search.perturb import can_fix_addresses
 from rsltrace.trace.reader import Trace
 
@@ -127,7 +128,15 @@ def test_of_a_job_that_uses_numbers_the_kernel_is_told(
     (tmp_path / "verified.py").write_text("from numpy.linalg import solve\n" + code)
     assert rsltrace("record", path, "-o", "run.mcap").returncode == 0
     with Trace.open(tmp_path / "run.mcap") as trace:
-        assert trace.environment["numerics"]
+        numerics = trace.environment["numerics"].split(", ")
+    assert "openblas" in numerics[1]
+    fewer = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA", "NPY_DISABLE_CPU_FEATURES": "X86_V4"}
+    rsltrace("record", path, "-o", "fewer.mcap", env={**os.environ, **fewer})
+    with Trace.open(tmp_path / "run.mcap") as one, Trace.open(tmp_path / "fewer.mcap") as other:
+        assert "X86_V4" not in other.environment["numerics"]
+        if "X86_V4" in numerics[0]:
+            settings = {setting.name for setting in environment_settings(one, other)}
+            assert settings == {"math", "numerics"}, "they round and sort differently"
 
 
 def test_a_node_cannot_pin_the_process(
