@@ -212,7 +212,7 @@ class _Parameters:
             self._all += found
         return found[0]
 
-    def rename(self, one: _Parameter, name: str) -> None:
+    def give_name(self, one: _Parameter, name: str) -> None:
         """Give a parameter another name."""
         self._by_name[one.name].remove(one)
         one.name = name
@@ -343,7 +343,7 @@ class _FileReader:
             self._at = self._parameters.named(name)
         else:
             self._at = self._parameters.named(self._path.text)
-            self._parameters.rename(self._at, f"{self._path.text}.{name}")
+            self._parameters.give_name(self._at, f"{self._path.text}.{name}")
 
 
 def _check_node(name: str) -> None:
