@@ -276,18 +276,21 @@ def _version_in(folder: str, name: str) -> Iterator[str]:
             yield from (value.strip() for key, _, value in lines if key.lower() == "version")
 
 
+_DIGITS_MAX = 4300
+"""Of whole numbers that Python reads or writes, unless it is told otherwise."""
+
+
 def _python_options() -> str:
     """Return the options of Python that change what programs do, "" if there are none."""
     flags = sys.flags
+    digits = getattr(sys, "get_int_max_str_digits", lambda: _DIGITS_MAX)()  # from 3.10.7 on
     found = {
         f"-O{flags.optimize}": flags.optimize,
         "-b": flags.bytes_warning,
         "-X dev": flags.dev_mode,
         "-X utf8": flags.utf8_mode,
         "-X no_debug_ranges": "no_debug_ranges" in sys._xoptions,
-        f"-X int_max_str_digits={sys.get_int_max_str_digits()}": (
-            sys.get_int_max_str_digits() != sys.int_info.default_max_str_digits
-        ),
+        f"-X int_max_str_digits={digits}": digits != _DIGITS_MAX,
     }
     found.update(
         (f"-W error::{getattr(kind, '__name__', kind)}", True)
