@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import lru_cache
+from pathlib import Path
 
 from rsltrace.guard.engagement import engage
 
@@ -173,8 +174,8 @@ def _name_of(distribution: str) -> str:
 
 
 def _content(path: str, name: str) -> bytes:
-    with suppress(OSError), open(os.path.join(path, name), "rb") as file:
-        return file.read()
+    with suppress(OSError):
+        return Path(path, name).read_bytes()  # a node may have replaced open
     return b""
 
 

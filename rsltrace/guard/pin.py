@@ -1,8 +1,9 @@
 """Pin the process: set what must be set before Python starts, and what libraries read once.
 
 ``pin`` starts the same command again in this process: with a fixed hash seed, without address-space
-randomization (where the kernel allows it), in UTC and C.UTF-8, with one thread per numerical
-library and sorted library folders. It costs one start of Python. ``unpin`` goes back.
+randomization (where the kernel allows it), in UTC and C.UTF-8, without Python's own options, with
+one thread per numerical library and sorted library folders. It costs one start of Python.
+``unpin`` goes back.
 """
 
 from __future__ import annotations
@@ -30,6 +31,17 @@ THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
     "RAYON_NUM_THREADS",  # libraries written in Rust
 )
+PYTHON_OPTIONS = (
+    "PYTHONOPTIMIZE",  # no assert, no docstrings
+    "PYTHONWARNINGS",  # warnings that raise
+    "PYTHONINTMAXSTRDIGITS",
+    "PYTHONDEVMODE",
+    "PYTHONASYNCIODEBUG",
+    "PYTHONNODEBUGRANGES",  # no marks in tracebacks
+    "PYTHONUTF8",
+    "PYTHONIOENCODING",
+)
+"""Variables that change what Python programs do; a pinned process has none of them."""
 PINNED_VARIABLES = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREAD_VARIABLES, "1")}
 
 MEMORY_NOISE = "RSLTRACE_MEMORY_NOISE"
@@ -64,7 +76,7 @@ def pin() -> None:
     _before = os.environ.pop(_MARK, _before)  # programs that a node starts are none of ours
     if _before or not sys.orig_argv[1:]:
         return
-    changes = pinned_variables()
+    changes = {**pinned_variables(), **dict.fromkeys(PYTHON_OPTIONS)}
     before = {name: os.environ.get(name) for name in changes}
     fixed = fix_addresses(True)
     _start_again({**changes, _MARK: repr({**before, "addresses": fixed})})

@@ -489,6 +489,8 @@ RULES: dict[str, Rule] = {
     **_calls(_MACHINE, "grp", "getgrgid getgrnam getgrall", restore=None),
     **_calls(_MACHINE, "socket", "if_nameindex"),
     **_calls(_MACHINE, "site", "getuserbase getusersitepackages"),
+    **_calls(_MACHINE, "tempfile", "gettempdir gettempdirb"),
+    **_calls(_MACHINE, "rclpy.logging", "get_logging_directory", restore=None),
     **_calls(_MACHINE, "os", "uname", restore=os.uname_result),
     **_calls(_MACHINE, "os", "getpgid getsid umask", restore=None),
     **_calls(_MACHINE, "resource", "getrlimit prlimit", restore=tuple),

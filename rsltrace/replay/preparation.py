@@ -371,7 +371,8 @@ def job_of_native(trace: Trace, job: Job) -> Job:
 
 def _changes(trace: Trace) -> Iterator[EnvironmentChange]:
     """Yield the differences of environment, as far as known before libraries are loaded."""
-    recorded, present = trace.environment, environment()
+    present = environment()
+    recorded = {"math": present["math"], **trace.environment}  # older traces do not tell it
     for name in sorted({*recorded, *present} - {"numerics", "ros_distro", "addresses"}):
         if recorded.get(name) != present.get(name):
             yield EnvironmentChange(name, recorded.get(name, ""), present.get(name, ""))

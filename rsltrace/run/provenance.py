@@ -5,16 +5,19 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+import math
 import os
 import platform
 import sys
 import warnings
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
+from typing import Any
 
 from rsltrace._version import __version__
 from rsltrace.guard.callers import is_rsltrace_module, is_user_file
@@ -32,9 +35,10 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.writer import TraceWriter
 
-# OpenBLAS and similar libraries round differently on different processors. A trace names their
-# kernels, but only if the job's modules use such libraries: others have the same bytes everywhere.
+# numpy, OpenBLAS and similar libraries round differently on different processors. A trace names
+# their kernels, but only if the job's modules use such libraries.
 
+_LIBC = "CS_GNU_LIBC_VERSION"
 _LIBRARIES = frozenset(
     "numpy scipy pandas cv2 torch tensorflow jax numba sklearn casadi cvxpy filterpy pinocchio "
     "shapely skimage".split()
@@ -71,7 +75,24 @@ def _kernels() -> str:
         " ".join(str(pool[key]) for key in keys if pool.get(key))
         for pool in import_threadpoolctl().threadpool_info()
     }
-    return ", ".join(sorted(found))
+    return ", ".join(sorted(found | {_numpy_kernels()}))
+
+
+def _numpy_kernels() -> str:
+    """Return the instructions numpy's own functions use: it sorts and rounds by them, too."""
+    core: Any = sys.modules.get("numpy._core._multiarray_umath")  # from numpy 2 on
+    core = core or sys.modules["numpy.core._multiarray_umath"]
+    return " ".join(["numpy", *filter(core.__cpu_features__.get, core.__cpu_dispatch__)])
+
+
+def _math_functions() -> str:
+    """Return the C library's version, and a checksum of what its functions give: they round by the
+    instructions of the processor."""
+    names = getattr(os, "confstr_names", {})
+    version = os.confstr(_LIBC) if _LIBC in names else None
+    numbers = [1 + n / 7.3 for n in range(300)]
+    found = [[math.pow(x, 1.7), math.log2(x), math.exp(-x), math.sin(x)] for x in numbers]
+    return f"{version or 'libc'}, rounding {zlib.crc32(repr(found).encode()):08x}"
 
 
 def _is_of_user(module: ModuleType) -> bool:
@@ -255,6 +276,30 @@ def _version_in(folder: str, name: str) -> Iterator[str]:
             yield from (value.strip() for key, _, value in lines if key.lower() == "version")
 
 
+_DIGITS_MAX = 4300
+"""Of whole numbers that Python reads or writes, unless it is told otherwise."""
+
+
+def _python_options() -> str:
+    """Return the options of Python that change what programs do, "" if there are none."""
+    flags = sys.flags
+    digits = getattr(sys, "get_int_max_str_digits", lambda: _DIGITS_MAX)()  # from 3.10.7 on
+    found = {
+        f"-O{flags.optimize}": flags.optimize,
+        "-b": flags.bytes_warning,
+        "-X dev": flags.dev_mode,
+        "-X utf8": flags.utf8_mode,
+        "-X no_debug_ranges": "no_debug_ranges" in sys._xoptions,
+        f"-X int_max_str_digits={digits}": digits != _DIGITS_MAX,
+    }
+    found.update(
+        (f"-W error::{getattr(kind, '__name__', kind)}", True)
+        for action, _, kind, *_ in warnings.filters
+        if action == "error"
+    )
+    return " ".join(option for option, is_set in found.items() if is_set)
+
+
 def environment(job: Job | None = None) -> dict[str, str]:
     """Return what a run's result may depend on: versions, never dates, names or paths.
 
@@ -267,7 +312,10 @@ def environment(job: Job | None = None) -> dict[str, str]:
         "machine": platform.machine(),
         "system": platform.system(),
         "hash_seed": os.environ.get(HASH_SEED, "random"),
+        "math": _math_functions(),
     }
+    if options := _python_options():
+        values["python_options"] = options
     values.update(_versions())
     kernels = "" if job is None else numerical_libraries(job)
     if kernels:

@@ -86,7 +86,7 @@ class Decoder:
             for name in types:  # once the classes are made, which would have them as fields
                 made = self._store.types[name].__init__.__globals__["FIELDDEFS"]
                 made[name][0].extend(_constants(types[name]))
-        except (TypesysError, _UnsafeSchema, RecursionError, KeyError) as error:
+        except (TypesysError, _UnsafeSchema, RecursionError, KeyError, ValueError) as error:
             raise self._unusable(error) from error
 
     def decode(self, data: bytes) -> object:

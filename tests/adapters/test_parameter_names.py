@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from rclpy.node import Node
 
 from rsltrace import NodeSpec
 from rsltrace.adapters.rclpy.entry import ros_arguments
+from rsltrace.adapters.rclpy.parameter_overrides import ParameterOverrides
 from tests.tiers import cases
 
 pytestmark = pytest.mark.ros
@@ -78,3 +80,28 @@ def test_any_name_keeps_its_value(parameters: dict[str, int]) -> None:
     for one in lists:
         found.update(one.parameters("/node"))
     assert found == parameters
+
+
+def test_numbers_of_many_digits_are_texts_and_many_names_are_found_at_once(tmp_path: Path) -> None:
+    """As ROS reads them; each name was looked for among all before it."""
+    names = ", ".join(f"k{n}: {{a: {n}}}" for n in range(2000))
+    path = tmp_path / "values.yaml"
+    path.write_text(f"node: {{ros__parameters: {{long: {'9' * 5000}, {names}, k7: {{a: -1}}}}}}\n")
+    overrides, compared = ParameterOverrides(), 0
+
+    def count(frame: Any, event: str, argument: object) -> Any:
+        nonlocal compared
+        compared += event == "line"
+        return count
+
+    sys.settrace(count)
+    try:
+        overrides.add_file(str(path))
+    finally:
+        sys.settrace(None)
+    values = overrides.of_node("/node")
+    assert values["long"] == "9" * 5000
+    assert list(values)[:3] == ["long", "k0.a", "k1.a"]
+    assert values["k7.a"] == -1
+    assert len(values) == 2001
+    assert compared < 2_000_000

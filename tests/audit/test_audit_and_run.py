@@ -49,6 +49,7 @@ CALLS = [
     "len(os.environ)",
     "os.getcwdb()",
     "os.getpid()",
+    "tempfile.gettempdir()",
     "os.getloadavg()",
     "gc.get_objects()",
     "threading.get_native_id()",
@@ -70,7 +71,8 @@ CALLS = [
 ]
 IMPORTS = (
     "import _random, array, ctypes, datetime, email.utils, gc, glob, numpy, os, pathlib, random, "
-    "secrets, socket, subprocess, sys, threading, time, timeit, uuid\nfrom rclpy.node import Node\n"
+    "secrets, socket, subprocess, sys, tempfile, threading, time, timeit, uuid\n"
+    "from rclpy.node import Node\n"
 )
 
 

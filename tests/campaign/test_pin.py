@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import rsltrace.guard.pin as pin
+from rsltrace.diff.causes.relevance import environment_settings
 from rsltrace.search.perturb import can_fix_addresses
 from rsltrace.trace.reader import Trace
 
@@ -50,6 +51,40 @@ def test_the_process_is_pinned_whatever_was_set(
     with Trace.open(tmp_path / "run.mcap") as trace:
         assert trace.environment["hash_seed"] == "0"
         assert "numerics" not in trace.environment, "no module of the job uses numbers"
+
+
+PYTHON = {
+    "PYTHONOPTIMIZE": "2",
+    "PYTHONWARNINGS": "error::UserWarning",
+    "PYTHONINTMAXSTRDIGITS": "640",
+    "PYTHONDEVMODE": "1",
+    "PYTHONASYNCIODEBUG": "1",
+    "PYTHONNODEBUGRANGES": "1",
+    "PYTHONUTF8": "1",
+    "PYTHONIOENCODING": "latin-1",
+}
+
+
+def test_no_option_of_python_changes_what_nodes_do(
+    rsltrace: Callable[..., Any], job: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = job(
+        "import warnings; assert warnings.warn('x') is None; "
+        "log(f'{__debug__} {sys.flags} {sys.get_int_max_str_digits()} {sys.stdout.encoding}')"
+    )
+    options = []
+    digests = set()
+    for environment, words in (({}, ()), (PYTHON, ()), (PYTHON, ("--no-pin",))):
+        done = rsltrace(
+            "record", path, "-o", "run.mcap", "--force", *words, env={**os.environ, **environment}
+        )
+        digests.add(done.stdout.split()[1])
+        with Trace.open(tmp_path / "run.mcap") as trace:
+            options.append(trace.environment.get("python_options"))
+    assert len(digests) == 2, "pinned, it is the same"
+    assert options[:2] == [None, None]
+    assert "-O2 -X dev" in options[2]
+    assert "-W error::UserWarning" in options[2]
 
 
 def test_libraries_are_looked_for_in_one_order(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +128,15 @@ def test_of_a_job_that_uses_numbers_the_kernel_is_told(
     (tmp_path / "verified.py").write_text("from numpy.linalg import solve\n" + code)
     assert rsltrace("record", path, "-o", "run.mcap").returncode == 0
     with Trace.open(tmp_path / "run.mcap") as trace:
-        assert trace.environment["numerics"]
+        numerics = trace.environment["numerics"].split(", ")
+    assert "openblas" in numerics[1]
+    fewer = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA", "NPY_DISABLE_CPU_FEATURES": "X86_V4"}
+    rsltrace("record", path, "-o", "fewer.mcap", env={**os.environ, **fewer})
+    with Trace.open(tmp_path / "run.mcap") as one, Trace.open(tmp_path / "fewer.mcap") as other:
+        assert "X86_V4" not in other.environment["numerics"]
+        if "X86_V4" in numerics[0]:
+            settings = {setting.name for setting in environment_settings(one, other)}
+            assert settings == {"math", "numerics"}, "they round and sort differently"
 
 
 def test_a_node_cannot_pin_the_process(

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from rsltrace.guard import libraries
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.object_numbers import ObjectNumbers
 from rsltrace.trace.model.finding import NondeterminismSource
@@ -166,6 +167,14 @@ def test_who_is_a_library() -> None:
     ):
         assert file is not None
         assert not is_user_file(file), file
+
+
+def test_a_node_may_replace_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    libraries._is_library.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr("builtins.open", None)
+        folder = Path(pytest.__file__).parents[1]
+        assert libraries.is_library(str(folder / "pytest" / "__init__.py"))
 
 
 @pytest.mark.long

@@ -199,6 +199,7 @@ HOSTILE_TEXTS = {
     "two fields of one name": "uint8 a\nuint16 a\n",
     "no fields at all": "%%%\n",
     "much text": "#" * (2 << 20),
+    "a constant of 5000 digits": f"int32 A={'9' * 5000}\nuint8 a\n",
 }
 
 

@@ -180,3 +180,35 @@ def test_a_value_is_not_expanded_again(package: SourcePackage) -> None:
     (package.folder / "CMakeLists.txt").write_text(text)
     flags = "${FLAGS}" + " -a" * 12
     assert [one.words for one in commands(package)] == [(flags,), (f"${{a_{flags}",)]
+
+
+_TRIPLED = 'set(a "${a}${a}${a}")\n' * 40
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        _TRIPLED,
+        "list(APPEND a ${a} ${a})\n" * 40,
+        'string(REPLACE a "${a}" a "${a}")\n' * 40,
+        "if(TRUE)\n" * 2000 + "endif()\n" * 2000,
+        f"if({'NOT ' * 5000}TRUE)\nendif()\n",
+        f'if("{"a" * 40}" MATCHES "(a+)+b")\nendif()\n',
+    ],
+    ids=["tripled", "appended", "replaced", "nested", "negated", "matched"],
+)
+def test_small_files_that_mean_enormous_ones_end(package: SourcePackage, text: str) -> None:
+    text = f"set(a aaaaaaaaaaaaaaaaaaaa)\ncalled(first)\n{text}"
+    (package.folder / "CMakeLists.txt").write_text(text)
+    found = commands(package)
+    assert found[0].words == ("first",)
+
+
+def test_files_outside_the_package_are_not_looked_for(package: SourcePackage) -> None:
+    outside = package.folder.parent / "outside.py"
+    outside.touch()
+    (package.folder / "CMakeLists.txt").write_text(
+        f"file(GLOB all ../*.py {outside} tools/../tools/*.py)\ncalled(${{all}})"
+    )
+    (call,) = commands(package)
+    assert [Path(word).name for word in call.words] == ["c.py", "d.py"]

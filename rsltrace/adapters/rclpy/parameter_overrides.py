@@ -7,6 +7,7 @@ sequence of events in which the place of a key decides what it means.
 from __future__ import annotations
 
 import re
+from bisect import insort
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from typing import Any
@@ -49,7 +50,10 @@ def scalar(text: str) -> bool | int | float | str:
         return _BOOL[text]
     if found := re.fullmatch(_INTEGER, text):
         digits = zip(found.groups()[1:], _BASES, strict=True)
-        number = next(int(word, base) for word, base in digits if word is not None)
+        try:
+            number = next(int(word, base) for word, base in digits if word is not None)
+        except ValueError:
+            number = 2**63  # of more digits than Python reads: out of range
         number = -number if found[1] == "-" else number
         if -(2**63) <= number < 2**63:
             return number
@@ -93,7 +97,7 @@ class ParameterOverrides:
     """The parameters of a list of arguments: by (pattern of the) name of a node, in order."""
 
     def __init__(self) -> None:
-        self._nodes: dict[str, list[_Parameter]] = {}
+        self._nodes: dict[str, _Parameters] = {}
 
     def of_node(self, full_name: str) -> dict[str, Any]:
         """Return the parameters of a node, later ones over earlier ones.
@@ -115,7 +119,7 @@ class ParameterOverrides:
         """
         if not text:
             raise ParameterFault(NO_TEXT)
-        parameter, sequence = _named(self._nodes.setdefault(node, []), name), _Sequence()
+        parameter, sequence = self._nodes.setdefault(node, _Parameters()).named(name), _Sequence()
         for event in _events(text.encode(), lambda _: "Error parsing an event"):
             kind = type(event).__name__
             if kind == "ScalarEvent":
@@ -158,8 +162,10 @@ class _Sequence:
 class _Parameter:
     """One parameter. It may have values of several types: a file sets one and leaves the others."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, number: int) -> None:
         self.name = name
+        self.number = number
+        """Its place in the order of the node's parameters."""
         self._values: dict[tuple[bool, type], Any] = {}
 
     def take(self, event: Any, sequence: _Sequence) -> None:
@@ -188,13 +194,29 @@ class _Parameter:
         return next((self._values[kind] for kind in _KINDS if kind in self._values), None)
 
 
-def _named(parameters: list[_Parameter], name: str) -> _Parameter:
-    """Return the parameter of a name, which is added if need be."""
-    for one in parameters:
-        if one.name == name:
-            return one
-    parameters.append(_Parameter(name))
-    return parameters[-1]
+class _Parameters:
+    """The parameters of a node. Several may have one name, which means the first of them."""
+
+    def __init__(self) -> None:
+        self._all: list[_Parameter] = []
+        self._by_name: dict[str, list[_Parameter]] = {}
+
+    def __iter__(self) -> Iterator[_Parameter]:
+        return iter(self._all)
+
+    def named(self, name: str) -> _Parameter:
+        """Return the parameter of a name, which is added if need be."""
+        found = self._by_name.setdefault(name, [])
+        if not found:
+            found.append(_Parameter(name, len(self._all)))
+            self._all += found
+        return found[0]
+
+    def give_name(self, one: _Parameter, name: str) -> None:
+        """Give a parameter another name."""
+        self._by_name[one.name].remove(one)
+        one.name = name
+        insort(self._by_name.setdefault(name, []), one, key=lambda other: other.number)
 
 
 def _events(text: bytes, fault: Callable[[int], str]) -> Iterator[Any]:
@@ -236,9 +258,9 @@ class _Path:
 class _FileReader:
     """Reads the events of a parameter file into ``nodes``."""
 
-    def __init__(self, nodes: dict[str, list[_Parameter]]) -> None:
+    def __init__(self, nodes: dict[str, _Parameters]) -> None:
         self._nodes = nodes
-        self._parameters: list[_Parameter] | None = None
+        self._parameters: _Parameters | None = None
         """Those of the node that is read."""
         self._at: _Parameter | None = None
         """The parameter that the last key has named."""
@@ -304,7 +326,7 @@ class _FileReader:
                 fault = f"There are no node names before {_PARAMETERS} at line {line}"
                 raise ParameterFault(fault)
             _check_node(self._node_path.text)
-            self._parameters = self._nodes.setdefault(self._node_path.text, [])
+            self._parameters = self._nodes.setdefault(self._node_path.text, _Parameters())
             self._at = next(iter(self._parameters), None)
             self._node_path.pop()
             self._below_parameters = True
@@ -318,10 +340,10 @@ class _FileReader:
             self._path.count += 1
             self._is_new_map = False
         if not self._path.count:
-            self._at = _named(self._parameters, name)
+            self._at = self._parameters.named(name)
         else:
-            self._at = _named(self._parameters, self._path.text)
-            self._at.name = f"{self._path.text}.{name}"
+            self._at = self._parameters.named(self._path.text)
+            self._parameters.give_name(self._at, f"{self._path.text}.{name}")
 
 
 def _check_node(name: str) -> None:

@@ -11,6 +11,7 @@ may well have set it.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,6 +25,11 @@ from rsltrace.source_packages import SourcePackage
 
 _COMMANDS_MAX = 20_000
 """What a file may come to: a recursion has no end of its own."""
+_CHARACTERS_MAX = 20_000_000
+"""How long the values that it uses may be in all: a list may double in each line."""
+_BLOCKS_MAX = 30
+_CONDITION_WORDS_MAX = 100
+_MATCHED_CHARACTERS_MAX = 300
 _TOKEN = re.compile(
     r"""(?P<space>[\s;]+)|\#\[(?P<comment_mark>=*)\[.*?\](?P=comment_mark)\]|(?P<comment>\#[^\n]*)
     |\[(?P<mark>=*)\[\n?(?P<bracket>.*?)\](?P=mark)\]|"(?P<quoted>(?:[^"\\]|\\.)*)"
@@ -175,6 +181,8 @@ class _CMakeInterpreter:
         self._functions: dict[str, tuple[_WrittenCommand, list[_WrittenCommand]]] = {}
         self._depth = 0
         self._left = _COMMANDS_MAX
+        self._characters_left = _CHARACTERS_MAX
+        self._blocks = 0
         here = str(package.folder)
         own = ("CMAKE_CURRENT_SOURCE_DIR", "PROJECT_SOURCE_DIR", "CMAKE_SOURCE_DIR")
         self._scope = _VariableScope(
@@ -213,6 +221,12 @@ class _CMakeInterpreter:
                 self._call(call)
 
     def _block(self, call: _WrittenCommand, body: list[_WrittenCommand]) -> None:
+        if self._blocks < _BLOCKS_MAX:
+            self._blocks += 1
+            self._enter(call, body)
+            self._blocks -= 1
+
+    def _enter(self, call: _WrittenCommand, body: list[_WrittenCommand]) -> None:
         if call.name == "if":
             for part in self._branches(call, body):
                 self._run(part)
@@ -343,7 +357,11 @@ class _CMakeInterpreter:
         elif kind == "REMOVE_ITEM":
             items = [one for one in items if one not in rest]
         elif kind == "FILTER" and len(rest) == 3 and (wanted := _pattern(rest[2])):
-            items = [one for one in items if bool(wanted.search(one)) is (rest[0] == "INCLUDE")]
+            wanted_is = rest[0] == "INCLUDE"
+            if max(map(len, items), default=0) > _MATCHED_CHARACTERS_MAX:
+                self._forget(name)
+                return
+            items = [one for one in items if bool(wanted.search(one)) is wanted_is]
         else:
             self._forget_all(words)
             return
@@ -354,7 +372,9 @@ class _CMakeInterpreter:
         if kind in ("TOLOWER", "TOUPPER") and len(rest) == 2:
             self._scope.values[rest[1]] = rest[0].lower() if kind == "TOLOWER" else rest[0].upper()
         elif kind == "REPLACE" and len(rest) >= 4:
-            self._scope.values[rest[2]] = "".join(rest[3:]).replace(rest[0], rest[1])
+            text = "".join(rest[3:])
+            if self._may_use(text.count(rest[0]) * len(rest[1])):
+                self._scope.values[rest[2]] = text.replace(rest[0], rest[1])
         else:
             self._forget_all(words)
 
@@ -373,10 +393,12 @@ class _CMakeInterpreter:
             return
         files = set[Path]()
         for pattern in rest:
-            place = self._folder / pattern
+            place = Path(os.path.normpath(self._folder / pattern))
+            if not place.is_relative_to(self._top):
+                continue  # all of the machine may be there
             if kind == "GLOB":
                 files |= {Path(one) for one in glob(str(place))}
-            elif place.parent.is_relative_to(self._top):
+            else:
                 files |= {one for one in place.parent.rglob(place.name) if one.is_file()}
         found = sorted(files)
         texts = (str(one if base is None else _below(one, base)) for one in found)
@@ -433,8 +455,20 @@ class _CMakeInterpreter:
             if self._scope.get(word) is not None:
                 self._forget(word)
 
-    def _list(self, name: str) -> list[str]:
+    def _may_use(self, characters: int) -> bool:
+        """Count characters of values; at the limit nothing more is followed."""
+        self._characters_left -= characters
+        if self._characters_left < 0:
+            self._left = 0
+        return self._left > 0
+
+    def _value(self, name: str) -> str | None:
+        """Return the value of a variable for use, None if there is none."""
         value = self._scope.get(name)
+        return value if value is None or self._may_use(len(value)) else None
+
+    def _list(self, name: str) -> list[str]:
+        value = self._value(name)
         if value is None:
             return []
         return [one for one in value.split(";") if one]
@@ -464,7 +498,7 @@ class _CMakeInterpreter:
                 parts.append("")
             elif token == "}" and opened:
                 name, opening = parts.pop(), opened.pop()
-                value = self._scope.get(name) if opening == "${" else None
+                value = self._value(name) if opening == "${" else None
                 parts[-1] += f"{opening}{name}}}" if value is None else value
             else:
                 parts[-1] += token
@@ -474,7 +508,9 @@ class _CMakeInterpreter:
 
     def _holds(self, words: list[_Word]) -> bool | None:
         """Return whether a condition holds, None if nobody knows."""
-        if any(word.text in ("(", ")") and not word.quoted for word in words):
+        if len(words) > _CONDITION_WORDS_MAX or any(
+            word.text in ("(", ")") and not word.quoted for word in words
+        ):
             return None
         for joint, decides in (("OR", True), ("AND", False)):
             places = [i for i, one in enumerate(words) if one == _Word(joint)]
@@ -512,7 +548,9 @@ class _CMakeInterpreter:
             if texts[1] != "MATCHES":
                 return left == right
             pattern = _pattern(right)
-            return None if pattern is None else pattern.search(left) is not None
+            if pattern is None or len(left) > _MATCHED_CHARACTERS_MAX:
+                return None
+            return pattern.search(left) is not None
         return None
 
     def _truth(self, text: str, *, is_plain: bool) -> bool | None:
@@ -537,7 +575,10 @@ def _end_of(calls: Sequence[_WrittenCommand], index: int, name: str) -> int:
 
 
 def _pattern(text: str) -> re.Pattern[str] | None:
-    """Return one of CMake's regular expressions, None if Python has none of that kind."""
+    """Return one of CMake's regular expressions, None if Python has none of that kind, or if it
+    may take for ever: it repeats groups, or much."""
+    if re.search(r"\)[*+?{]", text) or len(re.findall(r"[*+]", text)) > 3:
+        return None
     try:
         return re.compile(text)
     except re.error:

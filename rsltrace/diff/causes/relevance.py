@@ -48,6 +48,8 @@ def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
     ):
         is_code = kind is SettingKind.CODE
         for name in sorted({*of_a, *of_b}, key=lambda name: (name not in _FIRST, name)):
+            if name == "math" and not (name in of_a and name in of_b):
+                continue  # older traces do not tell it
             if of_a.get(name) != of_b.get(name) and not (is_code and same_code(a, b, name)):
                 file = name.removeprefix("file:")
                 kind_of_it = kind if file == name else SettingKind.FILE
