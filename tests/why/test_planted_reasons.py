@@ -309,6 +309,7 @@ def test_the_qos_of_an_entity_is_what_the_trace_shows(qos: Qos) -> None:
         (("source", "tck"), "has no callback of /source that is called 'tck'; there are"),
         (("listener", "qick"), "did you mean '/quick'?"),
         (("listener", "/tick"), "did you mean '/quick'?"),
+        (("/numbers", ""), "/numbers is not a node; /listener receives it"),
     ],
 )
 def test_unknown_names(words: tuple[str, str], error: str, traces: Callable[[str], Path]) -> None:

@@ -247,9 +247,13 @@ class LaunchFileReader:
                 self._open.pop()
 
 
+def shown_path(path: Path) -> str:
+    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
+
+
 def _read(path: Path, where: str) -> tuple[str, str]:
     """Return how to call a launch file in messages, and its text."""
-    name = os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
+    name = shown_path(path)
     try:
         data = read_regular(path, SIZE_MAX + 1)
     except FileNotFoundError:
