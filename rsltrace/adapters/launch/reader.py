@@ -226,7 +226,8 @@ class LaunchFileReader:
     def _include(self, path: Path) -> None:
         path = Path(os.path.abspath(path))
         if len(self._open) >= _INCLUDES_MAX:
-            raise JobError(f"launch files include each other: {self._open[-1].name}")
+            names = dict.fromkeys(one.name for one in (*self._open, path))
+            raise JobError(f"launch files include each other: {', '.join(names)}")
         where = "" if self._open else str(path)  # an include knows its own place
         name, text = _read(path, where)
         with self.context.within(file=path):
