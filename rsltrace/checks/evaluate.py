@@ -272,7 +272,7 @@ def wrong_checks(job: Job, names: RunNames) -> Iterator[str]:
             _wrong_names(job, index, spec, names)
             _conditions(job, index, spec, names)
         except JobError as error:
-            yield str(error)
+            yield str(error).partition("\n")[0]
 
 
 def job_of_checks(trace: Trace) -> Job:
@@ -450,7 +450,7 @@ def _located(job: Job, index: int, key: str) -> Iterator[None]:
         yield
     except ConditionError as error:
         where = locate(job, ("checks", index, key))
-        raise JobError(f"{key}: {error.message}", where=where) from None
+        raise JobError(f"{key}: {error}", where=where) from None
 
 
 def _result(spec: CheckSpec, one: RunProperty) -> CheckResult:

@@ -49,6 +49,12 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
     called = nodes_called(node, [one.name for one in nodes])
     if not called:
         known = [one.name for one in nodes]
+        ends = [one for one in trace.entities.values() if one.name == node]
+        if ends:
+            at = [trace.node_of(one).name for one in ends if one.kind in WITH_CALLBACK]
+            who = ", ".join(dict.fromkeys(at)) or "no node"
+            text = f"{node} is not a node; {who} receives it: rsltrace why TRACE NODE {node}"
+            raise TraceError(printable(text))
         reason = None if nearest(node, known) else _not_begun(history, node)
         return reason or _fail(trace, "node", node, known)
     own = [one for one in nodes if one.name == called[0]]

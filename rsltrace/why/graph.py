@@ -10,7 +10,7 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind, RandomDecision, decision_kind, decision_text
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable, shortened
-from rsltrace.why.question import SENDERS, Question
+from rsltrace.why.question import SENDERS, Question, qos_of
 from rsltrace.why.reason import Reason
 
 _TEXT_MAX = 200
@@ -153,10 +153,8 @@ class IncompatibleQos(Reason):
 
     def evidence(self) -> Iterator[str]:
         for one in (*self.question.senders, self.question.entity):
-            qos = one.detail.get("qos")
-            policies = [f"{k} {v}" for k, v in qos.items()] if isinstance(qos, dict) else []
             place = printable(self.question.place_of(one.id))
-            yield f"{self.question.named(one.id)} at {place}: {', '.join(policies)}"
+            yield f"{self.question.named(one.id)} at {place}: {qos_of(one).describe()}"
 
 
 @dataclass(frozen=True)

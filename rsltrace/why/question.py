@@ -14,7 +14,7 @@ from typing import Any
 from rsltrace.simulation.middleware.qos.policies import Qos, incompatible_policies
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, OutputKind
-from rsltrace.trace.model.texts import printable
+from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.words.code import entity_places
 from rsltrace.trace.words.phrases import exception_of
 from rsltrace.why.history import Message, Occupation, RunHistory
@@ -100,10 +100,7 @@ class Question:
     def mismatch(self, sender: Entity) -> tuple[str, str, str] | None:
         """Return the first policy that keeps a publisher from this subscription, what is offered
         and what is requested; None if they match."""
-        details = [one.detail.get("qos") for one in (sender, self.entity)]
-        offered, requested = (
-            Qos.from_summary(one if isinstance(one, dict) else {}) for one in details
-        )
+        offered, requested = qos_of(sender), qos_of(self.entity)
         policies = incompatible_policies(offered, requested)
         if not policies:
             return None
@@ -112,7 +109,8 @@ class Question:
             policy = "lease"
         shown = [one.summary() for one in (offered, requested)]
         values = [one.get(policy, one.get(f"{policy}_ns", "unlimited")) for one in shown]
-        return policy, str(values[0]), str(values[1])
+        texts = [format_duration(one) if isinstance(one, int) else str(one) for one in values]
+        return policy, texts[0], texts[1]
 
     def is_silent(self, sent: list[Message], until_ns: int) -> bool:
         """Whether more time than usual has passed since the last of some messages."""
@@ -155,6 +153,11 @@ class Question:
             if f"/{path}".endswith(f"/{file}")
         ]
         return printable(exception_of(text)), places[-1] if places else ""
+
+
+def qos_of(entity: Entity) -> Qos:
+    shown = entity.detail.get("qos")
+    return Qos.from_summary(shown if isinstance(shown, dict) else {})
 
 
 def filter_of(entity: Entity) -> tuple[str, str, int] | None:

@@ -95,7 +95,8 @@ def test_metadata_that_is_wrong(
 def test_metadata_that_is_no_yaml(bag_maker: Maker, samples: list[Sample]) -> None:
     metadata = bag_maker(Path("bag"), samples) / "metadata.yaml"
     metadata.write_bytes(b"a: [\n")
-    assert message("bag").startswith("bag/metadata.yaml: not YAML (")
+    problem = "expected the node content, but found '<stream end>' in line 2"
+    assert message("bag") == f"bag/metadata.yaml: not YAML ({problem}); run 'ros2 bag reindex'"
     metadata.write_bytes(b"\xff\xfe")
     assert message("bag").startswith("bag/metadata.yaml: not YAML (")
     metadata.write_bytes(b"")

@@ -164,7 +164,10 @@ def test_a_silent_topic_is_too_slow(
     ("check", "said"),
     [
         ({"always": "/scna: min(ranges) < 2"}, "did you mean '/scan'"),
-        ({"always": "/scan.ranges[0] <"}, "not an expression"),
+        (
+            {"always": "/scan.ranges[0] <"},
+            "not an expression: invalid syntax\n  /scan: msg.ranges[0] <",
+        ),
         ({"always": "/scan"}, "for what must not happen, never"),
         ({"never": "node /driver"}, "takes a function"),
         ({"never": "when driver.x > 1"}, "takes a function"),

@@ -305,6 +305,45 @@ def _stamps(path: Path) -> list[int]:
         return [trace.event(0).stamp_ns]
 
 
+LATE = """
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Int64
+
+KEPT = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Map(Node):
+    def __init__(self):
+        super().__init__("map")
+        self.map = self.create_publisher(Int64, "/map", KEPT)
+        self.map.publish(Int64(data=1))
+        self.create_timer(1.5, lambda: self.map.publish(Int64(data=2)))
+
+
+class Planner(Node):
+    def __init__(self):
+        super().__init__("planner")
+        self.create_subscription(Int64, "/map", lambda message: None, KEPT)
+"""
+
+
+def test_history_for_a_late_joiner_says_nothing_of_the_link(tmp_path: Path) -> None:
+    """It waited for the subscription; as a delay it would be late by that once more."""
+    (tmp_path / "late.py").write_text(LATE)
+    (tmp_path / "job.yaml").write_text(
+        "nodes: [{node: late:Map}, {node: late:Planner, start_after: 1s}]\n"
+        "start: 9s\ndelay: {default: 3ms}\nstop: {duration: 2s}\n"
+    )
+    record(load_job(tmp_path / "job.yaml"), tmp_path / "simulated.mcap")
+    as_native(tmp_path / "simulated.mcap", tmp_path / "native.mcap")
+    (link,) = look(tmp_path / "native.mcap").links
+    assert (link.delays.tolist(), link.history) == ([3 * MS], 1)
+    fitted = tmp_path / "fitted.yaml"
+    done = CliRunner().invoke(cli, ["fit", str(tmp_path / "native.mcap"), "-o", str(fitted)])
+    assert "left out 1 message sent before the subscription was created" in done.output
+
+
 @pytest.mark.long
 def test_messages_of_unknown_senders(known: Known, tmp_path: Path) -> None:
     path = as_native(known.simulated, tmp_path / "unknown.mcap", unknown=frozenset({"/image"}))

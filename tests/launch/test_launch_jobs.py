@@ -181,6 +181,17 @@ def test_a_launch_file_of_a_package(rsltrace: Command, folder: Path) -> None:
         assert message in str(caught.value)
 
 
+def test_a_launch_file_that_starts_nothing_is_named_from_here(
+    rsltrace: Command, folder: Path
+) -> None:
+    """Not from the launch file's own folder, where paths in it begin."""
+    (folder / "here" / "launch").mkdir(parents=True)
+    (folder / "here" / "launch" / "empty.launch.xml").write_text("<launch/>")
+    done = rsltrace("check", "--launch", "here/launch/empty.launch.xml")
+    assert done.returncode == 2
+    assert "error: here/launch/empty.launch.xml: the launch file starts nothing" in done.stderr
+
+
 def test_launch_specs_in_python(folder: Path) -> None:
     job = Job(launch=[LaunchSpec(file="demo.launch.xml", arguments={"word": 1.5, "b": True})])
     assert job.launch[0].arguments == {"word": "1.5", "b": "true"}
@@ -233,6 +244,7 @@ def test_ros_arguments_win_over_names_given_in_the_job(rsltrace: Command, folder
 def test_wrong_ros_arguments(rsltrace: Command) -> None:
     for words, message in [
         (["-p", "rate"], "ros_arguments (--ros-args): "),
+        (["-p", "rate=1"], "they are written -p [NODE:]NAME:=VALUE"),
         (["--params-file", "none.yaml"], "none.yaml"),
         (["--bogus"], "unknown ROS arguments"),
     ]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rsltrace.adapters.launch.api.parameters import parameters_for
 from rsltrace.adapters.launch.model import LaunchedNode, LaunchResult
 from rsltrace.adapters.launch.specs import node_specs as specs_of
 from rsltrace.errors import JobError
@@ -370,6 +371,18 @@ def test_mistakes_are_shown_at_their_place(read: Any, text: str, message: str) -
         specs_of(read(text), skip_unsupported=False, why_not=lambda package, executable: None)
     assert message in str(info.value)
     assert str(info.value).startswith("a.launch.xml")
+
+
+def test_files_that_include_each_other_are_all_named(read: Any, write: Any) -> None:
+    write("<launch><include file='a.launch.xml'/></launch>", "b.launch.xml")
+    with pytest.raises(JobError, match=r"include each other: a\.launch\.xml, b\.launch\.xml"):
+        read("<launch><include file='b.launch.xml'/></launch>")
+
+
+def test_a_parameter_file_that_is_not_yaml_says_where(write: Any) -> None:
+    path = str(write("/**:\n  ros__parameters:\n    speed: [1, 2\n", "p.yaml"))
+    with pytest.raises(JobError, match=r"p\.yaml: not YAML: expected ',' or '\]'.* in line 4"):
+        parameters_for(path, "/robot")
 
 
 BROKEN_YAML = [

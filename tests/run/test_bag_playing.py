@@ -276,7 +276,7 @@ def test_what_is_whole_of_an_mcap_that_was_cut_off_plays(play: Any, tmp_path: Pa
     assert 5 < len(got) < 60
     assert got == [(10 * S + i * S, i) for i in range(len(got))]
     (note,) = play.notes
-    assert "the recording was cut off: the first" in note
+    assert "cut off, only its beginning plays: the first" in note
     assert "bytes are whole" in note
 
 
@@ -320,7 +320,7 @@ def test_what_can_be_read_of_a_database_that_was_cut_off_plays(play: Any, tmp_pa
     got = played(play("bags: [a.db3]"))
     assert 50 < len(got) < 400
     assert got == [((10 + i) * S, i) for i in range(len(got))]
-    assert "cut off: the first" in play.notes[0]
+    assert "only its beginning plays: the first" in play.notes[0]
 
 
 def test_a_folder_without_metadata_plays_in_the_order_of_its_files(
@@ -331,7 +331,7 @@ def test_a_folder_without_metadata_plays_in_the_order_of_its_files(
         write_db3(tmp_path / "bag" / f"bag_{number}.db3", 2, first=number)
     got = [value for _, value in played(play("bags: [bag]"))]
     assert got == [0, 1, 2, 3, 10, 11]
-    assert "no metadata.yaml: bag_0.db3, bag_2.db3, bag_10.db3 play" in play.notes[0]
+    assert "no metadata.yaml; played without it: bag_0.db3, bag_2.db3, bag_10.db3" in play.notes[0]
 
 
 @pytest.mark.few(1)

@@ -91,9 +91,14 @@ PLANTED = [
         "graph", "listener", "on_names", "no_sender", "/source publishes /robot/names", "namespace"
     ),
     Planted(
-        *("graph", "listener", "/quick", "incompatible_qos", "publisher /quick of /source"),
+        *("graph", "listener", "on_quick", "incompatible_qos", "publisher /quick of /source"),
         "reliability",
         says="reliability is best_effort at the publisher, and the subscription asks for reliable",
+    ),
+    Planted(
+        *("graph", "listener", "on_often", "incompatible_qos", "publisher /quick of /source"),
+        "deadline",
+        says="deadline is unlimited at the publisher, and the subscription asks for 50 ms",
     ),
     Planted(
         *("graph", "listener", "on_kept", "incompatible_qos", "publisher /numbers of /source"),
@@ -304,6 +309,7 @@ def test_the_qos_of_an_entity_is_what_the_trace_shows(qos: Qos) -> None:
         (("source", "tck"), "has no callback of /source that is called 'tck'; there are"),
         (("listener", "qick"), "did you mean '/quick'?"),
         (("listener", "/tick"), "did you mean '/quick'?"),
+        (("/numbers", ""), "/numbers is not a node; /listener receives it"),
     ],
 )
 def test_unknown_names(words: tuple[str, str], error: str, traces: Callable[[str], Path]) -> None:

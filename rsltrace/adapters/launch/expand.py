@@ -17,7 +17,7 @@ from rsltrace.adapters.launch.model import (
     LaunchResult,
     argument_words,
 )
-from rsltrace.adapters.launch.reader import ProgramNeededError, read_launch_file
+from rsltrace.adapters.launch.reader import ProgramNeededError, read_launch_file, shown_path
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.adapters.workspace.imports import unbuilt_packages
 from rsltrace.child_processes import rsltrace_command
@@ -175,11 +175,9 @@ def _expand(
         notes += launched.ignored
     if not nodes and not job.bags:
         where = locate(job, ("launch", 0, "file"))
-        in_file = where[-1:].isdigit()  # not on the command line, nor made in Python
-        raise JobError(
-            "the launch file starts nothing that can be simulated",
-            where=where if in_file else job.launch[0].file,
-        )
+        if not where[-1:].isdigit():  # on the command line, or made in Python
+            where = shown_path(job.resolve(job.launch[0].file))
+        raise JobError("the launch file starts nothing that can be simulated", where=where)
     return JobExpansion(job.replace(nodes=nodes, launch=()), tuple(notes))
 
 
@@ -191,7 +189,7 @@ def _read(job: Job, index: int, folders: Sequence[Path] | None) -> LaunchResult:
         launched = read(path, spec.arguments)
     except ProgramNeededError:
         if folders is None:
-            raise JobError("a Python launch file is a program", where=spec.file) from None
+            raise JobError("a Python launch file is a program", where=shown_path(path)) from None
         launched = read_in_child_process(path, spec.arguments, folders)
     _check_known(job, index, launched.arguments)
     return launched

@@ -16,7 +16,7 @@ from rsltrace.errors import JobError, did_you_mean
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.reading.yaml_source import SourcePlace
 from rsltrace.trace.model.operation import nested_too_deep
-from rsltrace.trace.model.texts import printable
+from rsltrace.trace.model.texts import printable, yaml_problem
 
 # What a launch file can see while it is read: arguments, environment, namespace, defaults.
 
@@ -98,13 +98,28 @@ def yaml_value(text: str) -> Any:
     """Return what YAML 1.1 (that of ROS) reads, or the text itself where it is not YAML."""
     if nested_too_deep(text) >= 0:
         return text
+    try:
+        return _yaml().load(text)
+    except (YAMLError, ValueError):
+        return text
+
+
+def yaml_mistake(text: str) -> str:
+    """Return why a text is not YAML, ``""`` if it is."""
+    if nested_too_deep(text) >= 0:
+        return "brackets are nested too deeply"
+    try:
+        _yaml().load(text)
+    except (YAMLError, ValueError) as error:
+        return yaml_problem(error)
+    return ""
+
+
+def _yaml() -> YAML:
     yaml = YAML(typ="safe", pure=True)
     yaml.Constructor = _LaunchYamlConstructor
     yaml.version = (1, 1)
-    try:
-        return yaml.load(text)
-    except (YAMLError, ValueError):
-        return text
+    return yaml
 
 
 def inferred(text: str) -> Any:

@@ -226,7 +226,8 @@ class LaunchFileReader:
     def _include(self, path: Path) -> None:
         path = Path(os.path.abspath(path))
         if len(self._open) >= _INCLUDES_MAX:
-            raise JobError(f"launch files include each other: {self._open[-1].name}")
+            names = dict.fromkeys(one.name for one in (*self._open, path))
+            raise JobError(f"launch files include each other: {', '.join(names)}")
         where = "" if self._open else str(path)  # an include knows its own place
         name, text = _read(path, where)
         with self.context.within(file=path):
@@ -247,9 +248,13 @@ class LaunchFileReader:
                 self._open.pop()
 
 
+def shown_path(path: Path) -> str:
+    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
+
+
 def _read(path: Path, where: str) -> tuple[str, str]:
     """Return how to call a launch file in messages, and its text."""
-    name = os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
+    name = shown_path(path)
     try:
         data = read_regular(path, SIZE_MAX + 1)
     except FileNotFoundError:

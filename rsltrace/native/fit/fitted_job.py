@@ -207,6 +207,11 @@ def _of_link(link: LinkTimes) -> Iterator[str]:
             f"{link}: {link.negative} messages were received before they were sent, so clocks "
             "disagree; these are left out"
         )
+    if link.history:
+        yield (
+            f"{link}: left out {_counted(link.history, 'message')} sent before the subscription "
+            "was created (history of a late joiner)"
+        )
     if not len(link.delays):
         yield f"{link}: no delay is known; it is without delay"
     elif len(link.delays) < FEW:

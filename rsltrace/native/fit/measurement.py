@@ -12,7 +12,7 @@ from rsltrace.checks.latency.instances import Durations
 from rsltrace.errors import TraceError
 from rsltrace.trace.format import METADATA_NATIVE
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import EventFlag, EventKind
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.native import CUT_AFTER_NS, is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.timings import event_columns, missing_numbers, senders_of, timings
@@ -28,8 +28,8 @@ class LinkTimes:
     where nobody knows who sent (another process that was not observed). ``waits`` are the times
     from reception to callback, in the same order as ``delays``; a wait before which the clock was
     set is missing from both. ``negative`` counts what was received before it was sent, ``stepped``
-    what was on its way while the clock was set, ``missing`` the numbers between those that came,
-    None where that is unknown.
+    what was on its way while the clock was set, ``history`` what was sent before the subscription
+    was there, ``missing`` the numbers between those that came, None where that is unknown.
     """
 
     topic: str
@@ -41,6 +41,7 @@ class LinkTimes:
     waits: Durations
     negative: int
     stepped: int
+    history: int
     missing: int | None
 
     def __str__(self) -> str:
@@ -163,6 +164,7 @@ class _TraceColumns:
         self.source, self.ready = rows["source"].astype(np.int64), rows["ready"].astype(np.int64)
         self.ends = self.steady + rows["duration"].astype(np.int64)
         self.begin_ns = self._begin()
+        self.made = self._made()
         self.senders = senders_of(self.trace, self.events)
         last = len(rows) - 1
         self.steps = [
@@ -181,6 +183,15 @@ class _TraceColumns:
                 return int(due) - period
         made = self.ends[kinds == int(EventKind.CONSTRUCT)]
         return int(made.max()) if len(made) else int(self.steady[0])
+
+    def _made(self) -> dict[int, int]:
+        """Return when the events began that created the entities, by the system clock."""
+        parts = [outputs[["kind", "entity"]] for outputs in self.trace.outputs()]
+        outputs = np.concatenate(parts)
+        rows = np.flatnonzero(outputs["kind"] == int(OutputKind.ENTITY))
+        ends = np.cumsum(self.events["outputs"], dtype=np.int64)
+        at = self.wall[np.searchsorted(ends, rows, side="right")]
+        return dict(zip(outputs["entity"][rows].tolist(), at.tolist(), strict=True))
 
     def measured(self) -> NativeTimes:
         executor_of, executors = self._executors()
@@ -235,7 +246,11 @@ class _TraceColumns:
         for low, high in self.steps:
             stepped |= (source <= high) & (self.wall[places] >= low)
         negative = ~stepped & (delays < 0)
-        good = ~stepped & ~negative
+        # What a transient-local publisher kept for a late joiner waited for it, not on the link.
+        numbers = self.events["entity"][places].tolist()
+        made = np.array([0 if is_service else self.made.get(number, 0) for number in numbers])
+        history = ~stepped & (source < made)
+        good = ~stepped & ~negative & ~history
         missing = None
         if not is_service and sender is not None:
             numbers, who = self.rows["sequence"][places], self.senders[places]
@@ -250,6 +265,7 @@ class _TraceColumns:
             np.maximum(waits[good], 0),
             int(negative.sum()),
             int(stepped.sum()),
+            int(history.sum()),
             missing,
         )
 

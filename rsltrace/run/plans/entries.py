@@ -397,5 +397,7 @@ def arguments_for_all(job: Job) -> list[str]:
             RosArguments(["--ros-args", *words])
         except InvalidArgumentsError as error:
             where = locate(job, ("ros_arguments",))
-            raise JobError(f"ros_arguments (--ros-args): {error}", where=where) from None
+            forms = "-p [NODE:]NAME:=VALUE, -r FROM:=TO, --params-file FILE"
+            message = f"ros_arguments (--ros-args): {error}; they are written {forms}"
+            raise JobError(message, where=where) from None
     return words

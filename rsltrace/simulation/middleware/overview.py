@@ -9,11 +9,9 @@ from dataclasses import dataclass, field
 from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.simulation.middleware.publisher import Publisher
-from rsltrace.simulation.middleware.qos.policies import Liveliness, incompatible_policies
-from rsltrace.simulation.middleware.qos.timing import finite
+from rsltrace.simulation.middleware.qos.policies import incompatible_policies
 from rsltrace.simulation.middleware.subscription import Subscription
 from rsltrace.trace.model.operation import NODE_SERVICES, NODE_TOPICS
-from rsltrace.trace.model.texts import format_duration
 
 _ACTION = "/_action/"
 _CLOCK = "/clock"
@@ -154,15 +152,7 @@ def _actions(graph: Graph) -> Iterator[GraphLink]:
 
 
 def _end(endpoint: Publisher | Subscription) -> GraphEnd:
-    qos = endpoint.qos
-    history = "keep all" if qos.keep is None else f"keep last {qos.keep}"
-    words = [word.name.lower().replace("_", " ") for word in (qos.reliability, qos.durability)]
-    words.append(history)
-    if qos.liveliness is Liveliness.MANUAL_BY_TOPIC:
-        words.append("liveliness manual by topic")
-    limits = {"deadline": qos.deadline_ns, "lease": qos.lease_ns, "lifespan": qos.lifespan_ns}
-    words += [f"{name} {format_duration(ns)}" for name, ns in limits.items() if finite(ns)]
-    return GraphEnd(_name_of(endpoint), ", ".join(words))
+    return GraphEnd(_name_of(endpoint), endpoint.qos.describe())
 
 
 def _name_of(endpoint: DomainEntity) -> str:

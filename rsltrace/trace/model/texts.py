@@ -117,6 +117,13 @@ def printable_lines(text: str) -> str:
     return text if text.isprintable() else re.sub(_NOT_IN_LINES, _escaped, text)
 
 
+def yaml_problem(error: Exception) -> str:
+    """Return what a YAML parser complains about, and the line, on one line."""
+    mark, text = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    where = f" in line {mark.line + 1}" if mark else ""
+    return " ".join(str(text or error).split()) + where
+
+
 def shortened(text: str, width: int) -> str:
     """Return ``text`` cut to ``width`` characters, with an ellipsis if it was longer."""
     return text if len(text) <= width else text[: max(width - 1, 0)] + "…"

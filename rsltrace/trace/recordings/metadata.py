@@ -10,6 +10,7 @@ from typing import Any
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.records import METADATA_YAML_BYTES_MAX
 from rsltrace.trace.model.operation import nested_too_deep
+from rsltrace.trace.model.texts import yaml_problem
 from rsltrace.trace.recordings.topic import BagQos, parse_qos
 
 NAME = "metadata.yaml"
@@ -100,7 +101,7 @@ def _without_metadata(folder: Path) -> BagMetadata:
     names.sort(key=lambda name: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", name)])
     if not names:
         raise BagError(f"{folder}: not a bag: there is no {NAME} and no recording in it")
-    note = f"{folder}: there is no {NAME}: {', '.join(names)} play, without it"
+    note = f"{folder}: there is no {NAME}; played without it: {', '.join(names)}"
     return BagMetadata("", tuple(folder / name for name in names), None, {}, (note,))
 
 
@@ -123,6 +124,8 @@ def _load(path: Path) -> Any:
             raise BagError(f"{path}: brackets are nested too deeply; run 'ros2 bag reindex'")
         return YAML(typ="safe", pure=True).load(text)
     except (YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise BagError(f"{path}: not YAML ({error}); run 'ros2 bag reindex'") from None
+        raise BagError(
+            f"{path}: not YAML ({yaml_problem(error)}); run 'ros2 bag reindex'"
+        ) from None
     except OSError as error:
         raise BagError(f"{path}: {error.strerror}") from None

@@ -65,7 +65,7 @@ def recover_database(path: Path, target: Path) -> str:
         copy.close()
     if not messages or not isinstance(end_ns, int):
         return ""
-    return f"the first {messages} messages, up to log time {format_seconds(end_ns)},"
+    return f"the first {messages} messages, up to log time {format_seconds(end_ns)}"
 
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -155,7 +155,9 @@ def _open_file(path: Path, files: BagFiles, expected: str | None, *, recover: bo
     files.storage_id = storage_id
     files.storages.append(storage)
     if storage.cut_off:
-        files.notes.append(f"{path}: the recording was cut off: {storage.cut_off} play")
+        files.notes.append(
+            f"{path}: the recording was cut off, only its beginning plays: {storage.cut_off}"
+        )
 
 
 def _sqlite(path: Path, name: Path, files: BagFiles, *, recover: bool) -> SqliteFile:

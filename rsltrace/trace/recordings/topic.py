@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Any, Protocol
 
 from rsltrace.trace.model.operation import nested_too_deep
-from rsltrace.trace.model.texts import NS_PER_S
+from rsltrace.trace.model.texts import NS_PER_S, yaml_problem
 from rsltrace.trace.recordings.merge import BagMessage
 
 DURATION_INFINITE_NS = 2**63 - 1
@@ -112,7 +112,7 @@ def _parse_text(text: str) -> tuple[BagQos, ...]:
     try:
         value = YAML(typ="safe", pure=True).load(text)
     except (YAMLError, RecursionError) as error:
-        raise ValueError(f"the QoS profiles are not YAML: {error}") from None
+        raise ValueError(f"the QoS profiles are not YAML: {yaml_problem(error)}") from None
     if isinstance(value, str):
         raise ValueError(f"a list of QoS profiles was expected, not {value!r}")
     return parse_qos(value)

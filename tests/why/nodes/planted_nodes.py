@@ -14,6 +14,9 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+OFTEN = QoSProfile(
+    depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, deadline=Duration(seconds=0.05)
+)
 KEPT = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -58,6 +61,7 @@ class Listener(Node):
         self.create_subscription(TwistStamped, "nothing", self.on_nothing, 10)
         self.create_subscription(String, "names", self.on_names, 10)
         self.create_subscription(UInt64, "quick", self.on_quick, 10)
+        self.create_subscription(UInt64, "quick", self.on_often, OFTEN)
         self.create_subscription(UInt64, "numbers", self.on_kept, KEPT)
         self.create_subscription(String, "stopping", self.on_stopping, 10)
         self.client = self.create_client(Trigger, "reset")
@@ -71,6 +75,9 @@ class Listener(Node):
         pass
 
     def on_quick(self, message):  # reliability
+        pass
+
+    def on_often(self, message):  # deadline
         pass
 
     def on_kept(self, message):  # durability

@@ -16,7 +16,7 @@ from rsltrace.adapters.launch.api.basics import (
     as_substitutions,
     missing_package,
 )
-from rsltrace.adapters.launch.model import typed, yaml_value
+from rsltrace.adapters.launch.model import typed, yaml_mistake, yaml_value
 from rsltrace.adapters.launch.substitution import parse_template
 from rsltrace.errors import JobError
 from rsltrace.trace.model.regular_file import read_regular
@@ -51,6 +51,8 @@ def _read(path: str) -> str:
 def matching(text: str, path: str, full_name: str | None) -> dict[str, Any]:
     """Return the parameters for a node in the text of a file, by rcl's rules for wildcards."""
     content = yaml_value(text)
+    if isinstance(content, str) and (problem := yaml_mistake(text)):
+        raise JobError(f"not YAML: {problem}", where=path)
     if not isinstance(content, dict):
         raise JobError("this is not a parameter file (node: {ros__parameters: …})", where=path)
     values: dict[str, Any] = {}

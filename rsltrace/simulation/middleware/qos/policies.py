@@ -12,6 +12,7 @@ from enum import IntEnum
 from typing import Any
 
 from rsltrace.fast_dataclass import dataclass
+from rsltrace.trace.model.texts import format_duration
 
 
 class Reliability(IntEnum):
@@ -121,6 +122,20 @@ class Qos:
     def keep(self) -> int | None:
         """The size of a queue; None: unlimited."""
         return None if self.history is History.KEEP_ALL else max(self.depth, 1)
+
+    def describe(self) -> str:
+        """Return the policies in words, without those that are not limited."""
+        words = [self.reliability.name, self.durability.name]
+        words.append("KEEP_ALL" if self.keep is None else f"KEEP_LAST {self.keep}")
+        if self.liveliness is Liveliness.MANUAL_BY_TOPIC:
+            words.append("LIVELINESS MANUAL_BY_TOPIC")
+        limits = ("deadline_ns", "lease_ns", "lifespan_ns")
+        texts = [
+            f"{name.removesuffix('_ns')} {format_duration(value)}"
+            for name in limits
+            if 0 < (value := getattr(self, name)) < INFINITE_NS
+        ]
+        return ", ".join((*(word.lower().replace("_", " ") for word in words), *texts))
 
     def to_yaml(self) -> str:
         """Return the YAML list that rosbag2 keeps as ``offered_qos_profiles``."""
