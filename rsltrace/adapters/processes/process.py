@@ -69,7 +69,7 @@ class ProcessRun(EntityFactory, Protocol):
 
     log: Callable[[int, str, str], None]
     follows_clock: Callable[[str], bool]
-    note_answer: Callable[[NondeterminismSource, str, str, str, str], None]
+    note_answer: Callable[[NondeterminismSource, str, str, str, str, int], None]
     clock: Callable[[str | None, bool], tuple[int, bool]] | None
 
     def seed_of(self, key: str) -> int:
@@ -483,10 +483,11 @@ class Process:
             timer.due_at(deadline_ns)
 
     def _draw(self, fields: RecordReader) -> None:
-        source, call, answer = _SOURCES[fields.number()], fields.text(), fields.text()
+        source, calls = _SOURCES[fields.number()], fields.number()
+        call, answer = fields.text(), fields.text()
         running = self._running_node()
         node = running.key if running is not None else ""
-        self.adapter.note_answer(source, call, answer, stack_text(fields.rest()), node)
+        self.adapter.note_answer(source, call, answer, stack_text(fields.rest()), node, calls)
 
     def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()
