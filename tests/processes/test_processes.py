@@ -469,6 +469,20 @@ def test_of_many_draws_the_first_and_the_last_are_in_the_trace(
     )
 
 
+def test_a_variable_that_a_program_reads_is_the_cause(
+    counter: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, value in (("a", "7"), ("b", "8"), ("c", "7" + " " * 1000)):
+        monkeypatch.setenv("COUNT_FROM", value)
+        run(_job(tmp_path, counter), tmp_path / f"{name}.mcap")
+        run(_job(tmp_path, counter, "'100'", "heap"), tmp_path / f"heap_{name}.mcap")
+    (first,) = diff_files(tmp_path / "a.mcap", tmp_path / "b.mcap").divergences[:1]
+    assert "/counter read COUNT_FROM (7 in a, 8 in b)" in first.root_sentence
+    short, long = (_said(tmp_path / f"heap_{name}.mcap", "/count") for name in "ac")
+    assert short == long  # how long a value is does not show in addresses
+
+
 def test_a_diff_does_not_advise_to_record_the_state_of_a_process(
     counter: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,10 +4,14 @@
 
 #include <dlfcn.h>
 #include <execinfo.h>
+#include <limits.h>
+#include <stdio.h>
+#include <string.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cstdlib>
+#include <string_view>
 #include <unordered_map>
 #include <utility>
 #include <vector>
@@ -22,19 +26,25 @@ constexpr int DEPTH = 16;
 constexpr int DEPTH_OF_TEMPLATES = 64;  // of rclcpp, unoptimized
 constexpr std::uint32_t NOTES_PER_EVENT = 100;  // as many as the guard keeps
 constexpr std::uint32_t DRAWS_FIRST = 4;        // of an event, at each place: then only the last one
+constexpr std::size_t VARIABLE_BYTES = 4096;    // of a record
 constexpr std::uint32_t LOOKS_FIRST = 32;       // at clocks, from each place
 constexpr std::uint32_t SENDERS_FIRST = 32;     // as adapters/rclpy/concurrency/code_lines.py
 
 const char *const LIBRARIES[] = {"librcl.so", "librclcpp.so", "libc.so.6", "libstdc++.so.6"};
 
+// In no memory of the heap: how long paths are must not show in the program's addresses.
 bool is_library(const Dl_info &info) {
   Dl_info here{};
   if (dladdr(reinterpret_cast<const void *>(&note_sender), &here) != 0 && here.dli_fbase == info.dli_fbase) return true;
-  const std::string file = info.dli_fname;
+  const std::string_view file = info.dli_fname;
   const auto slash = file.rfind('/');
-  if (slash == std::string::npos || file.compare(slash + 1, 3, "lib") != 0) return false;
-  for (const char *name : LIBRARIES)
-    if (access((file.substr(0, slash + 1) + name).c_str(), F_OK) == 0) return true;
+  if (slash == std::string_view::npos || file.compare(slash + 1, 3, "lib") != 0) return false;
+  if (slash > 5 && file.substr(slash - 5, 5) == ".libs") return true;  // what a wheel brings along
+  char path[PATH_MAX];
+  for (const char *name : LIBRARIES) {
+    std::snprintf(path, sizeof path, "%.*s%s", static_cast<int>(slash + 1), file.data(), name);
+    if (access(path, F_OK) == 0) return true;
+  }
   return false;
 }
 
@@ -107,6 +117,11 @@ Writer start_of_record(Source source, std::uint32_t calls, const char *call, con
   return body;
 }
 
+void begin_event(Caller &caller) {
+  const auto now = static_cast<std::uint32_t>(times_let_go());
+  if (std::exchange(caller.event, now) != now) caller.calls = 0;
+}
+
 void keep_latest(Draw draw) {
   auto &draws = latest_draws();
   for (Draw &one : draws)
@@ -124,8 +139,7 @@ void note_answer(Source source, const char *call, const std::string &answer, con
   const Inside inside(*thread);
   Caller &caller = caller_at(where);
   const bool is_clock = source == Source::CLOCK;
-  const auto now = static_cast<std::uint32_t>(times_let_go());
-  if (!is_clock && std::exchange(caller.event, now) != now) caller.calls = 0;
+  if (!is_clock) begin_event(caller);
   // Clocks are looked at often, and show what the event's time is.
   if (++caller.calls > LOOKS_FIRST && is_clock) return;
   if (caller.calls > DRAWS_FIRST && !is_clock) return keep_latest({&caller, source, call, answer});
@@ -138,6 +152,24 @@ void note_answer(Source source, const char *call, const std::string &answer, con
   } else {
     write_stack(body);
   }
+  say(Say::DRAW, body);
+}
+
+void note_variable(const char *name, const char *value, const void *where) {
+  Thread *thread = me();
+  if (thread == nullptr || has_python()) return;  // which reads many as it starts
+  const Inside inside(*thread);
+  Caller &caller = caller_at(where);
+  begin_event(caller);
+  if (++caller.calls > DRAWS_FIRST) return;
+  Writer body;
+  body.bytes.reserve(VARIABLE_BYTES);  // as for paths
+  body.number(static_cast<std::uint32_t>(Source::VARIABLE));
+  body.number(1U);
+  body.blob(name, strnlen(name, VARIABLE_BYTES / 8));
+  body.number(value == nullptr ? 0U : 1U);
+  body.blob(value, value == nullptr ? 0 : strnlen(value, VARIABLE_BYTES / 8));
+  write_stack(body);
   say(Say::DRAW, body);
 }
 
@@ -200,4 +232,11 @@ RSLTRACE_EXPORT pid_t getpid() noexcept {
   const pid_t number = REAL(getpid)();
   RSLTRACE_NOTE(Source::PID, "getpid()", std::to_string(number));
   return number;
+}
+
+RSLTRACE_EXPORT char *getenv(const char *name) noexcept {
+  char *const value = REAL(getenv)(name);
+  const void *caller = __builtin_return_address(0);
+  if (is_own_code(caller)) note_variable(name, value, caller);
+  return value;
 }
