@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -33,6 +32,7 @@ from rsltrace.guard.rules import (
     sql_call,
 )
 from rsltrace.trace.model.finding import READ_BY, GuardMode, NondeterminismSource
+from rsltrace.trace.model.texts import variable_text
 
 _INSTALLED = (
     os.path.join(sys.prefix, ""),
@@ -217,7 +217,6 @@ _HELP_MODULES = {
     "argparse",
 }
 
-_SECRET = re.compile("key|token|secret|pass|credential|auth", re.IGNORECASE)
 
 _Environ: Any = type(os.environ)
 
@@ -253,7 +252,7 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
         guard.report_user_call(
             NondeterminismSource.ENVIRONMENT,
             call + _reader(frame),
-            _variable_text(name, value),
+            variable_text(name, value),
             frame,
         )
         return value
@@ -317,13 +316,6 @@ def _reader(frame: FrameType | None) -> str:
     if frame is None or not is_library(code_of(frame).co_filename):
         return ""
     return f"{READ_BY}{module_of(frame).partition('.')[0]}"
-
-
-def _variable_text(name: str | bytes, value: str | bytes) -> str:
-    """Return a variable's value as evidence; only a hash if it may be a secret."""
-    if _SECRET.search(os.fsdecode(name)) or len(value) > 200:
-        return f"SHA-256 {hashlib.sha256(os.fsencode(value)).hexdigest()[:16]}"
-    return repr(value)
 
 
 # -- audit events ---------------------------------------------------------------------------------

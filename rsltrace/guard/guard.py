@@ -292,24 +292,32 @@ class Guard:
         )
 
     def note_process_answer(
-        self, source: NondeterminismSource, call: str, answer: str, stack: str, node: str
+        self,
+        source: NondeterminismSource,
+        call: str,
+        answer: str,
+        stack: str,
+        node: str,
+        calls: int,
     ) -> None:
-        """Keep in the trace what compiled code drew or read: the run answers all but process ids,
-        which are a finding.
+        """Keep in the trace what compiled code drew or read, the last of so many ``calls``. Process
+        ids are a finding, variables are none, and the run answers the rest.
 
         :raises GuardError: if the job says that it is an error.
         """
         mode = self._policy.modes.get(source, DEFAULT_MODES[source])
+        if mode is _ALLOW and source is NondeterminismSource.ENVIRONMENT:
+            return
         if source is not NondeterminismSource.PID:
             mode = GuardMode.VIRTUAL
             counts = self._answered[source].setdefault(call, {})
-            counts[node] = counts.get(node, 0) + 1
+            counts[node] = counts.get(node, 0) + calls
         elif mode is _ALLOW:
             return
         else:
             mode = reporting_mode(mode)
             key = (source, mode, node, call)
-            self._found[key] = self._found.get(key, 0) + 1
+            self._found[key] = self._found.get(key, 0) + calls
         event, entity = self.context.place()
         if self._has_room(event):
             self.on_finding(Finding(event, entity, node, source, mode, call, answer, stack))

@@ -2,7 +2,7 @@
 //
 // Usage: counter [period in ms] [when to leave, or what to do at the fifth count: crash, exit, …]
 // Instead it publishes with "address" where its timer lies, with "heap" where new memory lies after a
-// draw, with "thread" its thread's id, with "heaps" from how many heaps two threads, one after the
+// draw, with "rand" the last of 90 random numbers and one for each count, with "thread" its thread's id, with "heaps" from how many heaps two threads, one after the
 // other, got memory. It counts from the number in COUNT_FROM, and from that in the file "more" in its
 // folder. With NAMED there is another node, and callbacks are told to tracetools as rclcpp does it.
 #include <pthread.h>
@@ -74,6 +74,7 @@ static void on_timer(rcl_timer_t *timer, int64_t since_last) {
   message.data = ++counted;
   if (strcmp(action, "address") == 0) message.data = (uint64_t)(uintptr_t)timer;
   if (strcmp(action, "heap") == 0) message.data = heap_after_draw();
+  for (uint64_t i = strcmp(action, "rand") == 0 ? 90 + counted : 0; i > 0; i--) message.data = rand();
   if (strcmp(action, "thread") == 0) message.data = (uint64_t)pthread_self();
   if (strcmp(action, "heaps") == 0) message.data = heaps_of_threads();
   // As rclcpp does with use_intra_process_comms: "both" if somebody outside of the process listens.

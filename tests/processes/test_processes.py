@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -446,6 +447,40 @@ def test_a_message_that_a_process_receives_can_be_edited(counter: Path, tmp_path
     assert numbers[half:] == [*numbers[:3], numbers[3] + 100, *numbers[4:half]]
     again = rsltrace.replay(tmp_path / "b.mcap", trust=True)
     assert again.is_whole, again.sentence
+
+
+def test_of_many_draws_the_first_and_the_last_are_in_the_trace(
+    counter: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, more in (("a", "0"), ("b", "1")):
+        (tmp_path / "more").write_text(more)
+        run(_job(tmp_path, counter, "'100'", "rand"), tmp_path / f"{name}.mcap")
+    with Trace.open(tmp_path / "a.mcap") as trace:
+        (draws,) = (met for met in trace.guarded if met.call == "rand()")
+        drawn = Counter(
+            one.event for found in trace.answers.values() for one in found if one.call == "rand()"
+        )
+    assert draws.count == sum(90 + count for count in range(1, 11))
+    assert [*drawn.values()] == [5] * 10
+    (first,) = diff_files(tmp_path / "a.mcap", tmp_path / "b.mcap").divergences[:1]
+    assert re.search(
+        r"/counter drew rand\(\) \(call 91: \d+ in a, call 92: \d+ in b\)", first.root_sentence
+    )
+
+
+def test_a_variable_that_a_program_reads_is_the_cause(
+    counter: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, value in (("a", "7"), ("b", "8"), ("c", "7" + " " * 1000)):
+        monkeypatch.setenv("COUNT_FROM", value)
+        run(_job(tmp_path, counter), tmp_path / f"{name}.mcap")
+        run(_job(tmp_path, counter, "'100'", "heap"), tmp_path / f"heap_{name}.mcap")
+    (first,) = diff_files(tmp_path / "a.mcap", tmp_path / "b.mcap").divergences[:1]
+    assert "/counter read COUNT_FROM (7 in a, 8 in b)" in first.root_sentence
+    short, long = (_said(tmp_path / f"heap_{name}.mcap", "/count") for name in "ac")
+    assert short == long  # how long a value is does not show in addresses
 
 
 def test_a_diff_does_not_advise_to_record_the_state_of_a_process(

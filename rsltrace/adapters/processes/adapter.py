@@ -62,10 +62,10 @@ Log = Callable[[int, str, str], None]
 class ProcessAdapter:
     """The processes of one run. ``on_end`` is called with the key of each that has ended;
     ``follows_clock`` says of a node whether /clock drives its ROS time. ``note_answer`` takes what
-    code has drawn or read (source, call, answer, stack, node). ``clock`` is there if nodes have
-    clocks of their own: given a node (None: nobody) and whether a ROS clock is looked at, it says
-    what is shown, and whether that stays so throughout the event. ``parallel``: processes compute
-    at the same time where the loop's order is first come, first served."""
+    code has drawn or read (source, call, answer, stack, node, how often). ``clock`` is there if
+    nodes have clocks of their own: given a node (None: nobody) and whether a ROS clock is looked
+    at, it says what is shown, and whether that stays so throughout the event. ``parallel``:
+    processes compute at the same time where the loop's order is first come, first served."""
 
     def __init__(self, domain: Domain, interfaces: TypeLookup, *, seed: int, log: Log) -> None:
         self.domain = domain
@@ -75,8 +75,8 @@ class ProcessAdapter:
         self.processes: list[Process] = []
         self.follows_clock: Callable[[str], bool] = lambda node: False
         self.clock: Callable[[str | None, bool], tuple[int, bool]] | None = None
-        self.note_answer: Callable[[NondeterminismSource, str, str, str, str], None]
-        self.note_answer = lambda source, call, answer, stack, node: None
+        self.note_answer: Callable[[NondeterminismSource, str, str, str, str, int], None]
+        self.note_answer = lambda source, call, answer, stack, node, calls: None
         self.on_end: Callable[[str], None] = lambda key: None
         self.parallel = False
         self._seed = seed

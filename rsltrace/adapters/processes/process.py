@@ -41,7 +41,7 @@ from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind
 from rsltrace.trace.model.finding import NondeterminismSource, unseen_text
-from rsltrace.trace.model.texts import format_seconds
+from rsltrace.trace.model.texts import format_seconds, variable_text
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
@@ -52,7 +52,12 @@ _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")
 _HELLO = struct.Struct("<qQIII")
 _SHOWN = struct.Struct("<qI")
-_SOURCES = (NondeterminismSource.RANDOM, NondeterminismSource.CLOCK, NondeterminismSource.PID)
+_SOURCES = (
+    NondeterminismSource.RANDOM,
+    NondeterminismSource.CLOCK,
+    NondeterminismSource.PID,
+    NondeterminismSource.ENVIRONMENT,
+)
 """What is drawn, by the numbers of ``native/call_sites.h``."""
 _RECORD_SIZE = RECORD.size
 _PUBLISH, _WAIT = int(RecordKind.PUBLISH), int(RecordKind.WAIT)
@@ -69,7 +74,7 @@ class ProcessRun(EntityFactory, Protocol):
 
     log: Callable[[int, str, str], None]
     follows_clock: Callable[[str], bool]
-    note_answer: Callable[[NondeterminismSource, str, str, str, str], None]
+    note_answer: Callable[[NondeterminismSource, str, str, str, str, int], None]
     clock: Callable[[str | None, bool], tuple[int, bool]] | None
 
     def seed_of(self, key: str) -> int:
@@ -483,10 +488,17 @@ class Process:
             timer.due_at(deadline_ns)
 
     def _draw(self, fields: RecordReader) -> None:
-        source, call, answer = _SOURCES[fields.number()], fields.text(), fields.text()
+        source, calls = _SOURCES[fields.number()], fields.number()
+        call = fields.text()
+        if source is NondeterminismSource.ENVIRONMENT:
+            is_set, value = fields.number(), fields.text()
+            answer = variable_text(call, value) if is_set else repr(None)
+            call = f"getenv({call!r})"
+        else:
+            answer = fields.text()
         running = self._running_node()
         node = running.key if running is not None else ""
-        self.adapter.note_answer(source, call, answer, stack_text(fields.rest()), node)
+        self.adapter.note_answer(source, call, answer, stack_text(fields.rest()), node, calls)
 
     def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()

@@ -20,6 +20,7 @@ from rsltrace.diff.causes.relevance import used_by
 from rsltrace.diff.facts.causes import UnrecordedAnswer
 from rsltrace.diff.facts.evidence import CallDifference, EventSummary
 from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.finding import Finding, GuardMode, NondeterminismSource
 from rsltrace.trace.model.texts import contrasting_texts, printable, shortened
 
@@ -35,7 +36,7 @@ STARTED_BY = "subprocess.Popen("
 _STARTED = "started"
 _ANSWER_MAX = 60
 _CHANGED = r"(\d+ bytes), changed \d+"
-_VARIABLE = r"os\.environ\[(['\"])(.+)\1\]"
+_VARIABLE = r"(?:os\.environ\[|getenv\()(['\"])(.+)\1[\])]"
 _FILE = r"\w[\w.]*\((?:PosixPath\()?(['\"])(?:[^'\"]*/)?([^'\"/]+)\1"
 _CONTENT = r"(\d+ bytes), (SHA-256 [0-9a-f]+)"
 
@@ -108,9 +109,20 @@ def _before(run: ComparedTrace, view: EventSummary | None, other: str = "") -> l
 
 def _is_of(run: ComparedTrace, finding: Finding, node: str, view: EventSummary) -> bool:
     if finding.node or node:
-        return finding.node == node
+        return finding.node == node or (not finding.node and _has_made(run, finding, node))
     entity = run.trace.entities.get(finding.entity)
     return entity is not None and entity.kind is EntityKind.MAIN and entity.name == view.entity.name
+
+
+def _has_made(run: ComparedTrace, finding: Finding, node: str) -> bool:
+    """Whether a node was made in the event of a call: by the main that made both."""
+    entities = run.trace.entities
+    made = [
+        entities.get(o.entity)
+        for o in run.trace.outputs_of(finding.event)
+        if o.kind is OutputKind.ENTITY
+    ]
+    return any(e is not None and e.kind is EntityKind.NODE and e.name == node for e in made)
 
 
 def _is_of_import(finding: Finding, files: frozenset[str]) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -12,6 +14,7 @@ NS_PER_S = 1_000_000_000
 _IN_FULL_NS = 1_000_000 * NS_PER_S
 _DIGITS = 6
 _DIGITS_MAX = 17
+_SECRET = re.compile("key|token|secret|pass|credential|auth", re.IGNORECASE)
 
 
 _ROS_RELEASES = {"3": "humble", "4": "iron", "7": "jazzy", "8": "rolling", "9": "kilted"}
@@ -144,3 +147,10 @@ def contrasting_texts(a: str, b: str, width: int = 40, before: int = 20) -> tupl
 def _escaped(match: re.Match[str]) -> str:
     character = match.group()
     return _SHORT.get(character) or character.encode("unicode_escape").decode("ascii")
+
+
+def variable_text(name: str | bytes, value: str | bytes) -> str:
+    """Return an environment variable's value as evidence; only a hash if it may be a secret."""
+    if _SECRET.search(os.fsdecode(name)) or len(value) > 200:
+        return f"SHA-256 {hashlib.sha256(os.fsencode(value)).hexdigest()[:16]}"
+    return repr(value)

@@ -277,6 +277,8 @@ void entropy() {
   std::uint64_t again = 0;
   const int opened = open("/dev/urandom", O_RDONLY);
   if (read(opened, &again, 8) != 8) std::abort();
+  const auto raw = static_cast<int>(syscall(SYS_openat, AT_FDCWD, "/dev/urandom", O_RDONLY));
+  if (read(raw, &words[2], 8) != 8) std::abort();
   dlopen("libuuid.so.1", RTLD_NOW | RTLD_GLOBAL);
   void *const found = dlsym(RTLD_DEFAULT, "uuid_generate");
   if (found != nullptr) reinterpret_cast<void (*)(std::uint64_t *)>(found)(words);
@@ -284,8 +286,8 @@ void entropy() {
   if (syscall(SYS_getrandom, &words[0], 8, 0) != 8) std::abort();
   std::string uuid;
   std::ifstream("/proc/sys/kernel/random/uuid") >> uuid;
-  std::printf("%s %08x %016llx %016llx\n", uuid.c_str(), device(), static_cast<unsigned long long>(again),
-              static_cast<unsigned long long>(words[0]));
+  std::printf("%s %08x %016llx %016llx %016llx\n", uuid.c_str(), device(), static_cast<unsigned long long>(again),
+              static_cast<unsigned long long>(words[0]), static_cast<unsigned long long>(words[2]));
 }
 
 void real_timers() {

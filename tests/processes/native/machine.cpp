@@ -4,6 +4,7 @@
 #include <sys/resource.h>
 #include <sys/syscall.h>
 #include <sys/time.h>
+#include <sys/timeb.h>
 #include <sys/times.h>
 #include <threads.h>
 #include <time.h>
@@ -37,7 +38,10 @@ void calls() {  // past the functions of libc
   sleep(2);
   if (syscall(SYS_getrusage, RUSAGE_SELF, &used) != 0) std::abort();
   const long passed = (syscall(SYS_times, &ticks) - before) / sysconf(_SC_CLK_TCK);
-  std::printf("%ld %ld %ld %ld\n", day.tv_sec, seconds, passed, used.ru_nvcsw);
+  timeb old;
+#pragma GCC diagnostic ignored "-Wdeprecated-declarations"
+  ftime(&old);
+  std::printf("%ld %ld %ld %ld %ld\n", day.tv_sec, seconds, passed, used.ru_nvcsw, old.time);
 }
 
 void start() {  // what the kernel gives a program when it starts, for its own chance

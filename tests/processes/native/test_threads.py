@@ -170,7 +170,7 @@ def test_where_memory_lies_does_not_depend_on_real_time(programs: Programs) -> N
 def test_chance_comes_from_the_seed_and_every_source_goes_on(corner: Corner) -> None:
     ran = corner("entropy")
     assert ran.out == corner("entropy").out != corner("entropy", native=True).out
-    assert len(set(ran.out.split())) == 9
+    assert len(set(ran.out.split())) == 10
     assert re.search(r" \w{8}-\w{4}-4\w{3}-[89ab]\w{3}-\w{12} ", ran.out)
 
 

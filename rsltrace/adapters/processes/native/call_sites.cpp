@@ -1,14 +1,19 @@
 // See call_sites.h. What a caller is, is found out once for each place; stacks are unwound only for
-// draws, which are few, and for the first messages of each callback.
+// the first draws and messages of each callback.
 #include "call_sites.h"
 
 #include <dlfcn.h>
 #include <execinfo.h>
+#include <limits.h>
+#include <stdio.h>
+#include <string.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cstdlib>
+#include <string_view>
 #include <unordered_map>
+#include <utility>
 #include <vector>
 
 #include "real.h"
@@ -20,29 +25,49 @@ namespace {
 constexpr int DEPTH = 16;
 constexpr int DEPTH_OF_TEMPLATES = 64;  // of rclcpp, unoptimized
 constexpr std::uint32_t NOTES_PER_EVENT = 100;  // as many as the guard keeps
+constexpr std::uint32_t DRAWS_FIRST = 4;        // of an event, at each place: then only the last one
+constexpr std::size_t VARIABLE_BYTES = 4096;    // of a record
 constexpr std::uint32_t LOOKS_FIRST = 32;       // at clocks, from each place
 constexpr std::uint32_t SENDERS_FIRST = 32;     // as adapters/rclpy/concurrency/code_lines.py
 
 const char *const LIBRARIES[] = {"librcl.so", "librclcpp.so", "libc.so.6", "libstdc++.so.6"};
 
+// In no memory of the heap: how long paths are must not show in the program's addresses.
 bool is_library(const Dl_info &info) {
   Dl_info here{};
   if (dladdr(reinterpret_cast<const void *>(&note_sender), &here) != 0 && here.dli_fbase == info.dli_fbase) return true;
-  const std::string file = info.dli_fname;
+  const std::string_view file = info.dli_fname;
   const auto slash = file.rfind('/');
-  if (slash == std::string::npos || file.compare(slash + 1, 3, "lib") != 0) return false;
-  for (const char *name : LIBRARIES)
-    if (access((file.substr(0, slash + 1) + name).c_str(), F_OK) == 0) return true;
+  if (slash == std::string_view::npos || file.compare(slash + 1, 3, "lib") != 0) return false;
+  if (slash > 5 && file.substr(slash - 5, 5) == ".libs") return true;  // what a wheel brings along
+  char path[PATH_MAX];
+  for (const char *name : LIBRARIES) {
+    std::snprintf(path, sizeof path, "%.*s%s", static_cast<int>(slash + 1), file.data(), name);
+    if (access(path, F_OK) == 0) return true;
+  }
   return false;
 }
 
 // Of libraries no more is kept: how long the path of ours is must not show in the heap.
 struct Caller {
   bool own = false;
+  std::uint32_t event = 0;  // in which it drew
   std::string file;
   std::uint64_t offset = 0;  // of the call, not of where it returns to
-  std::uint32_t looks = 0;
+  std::uint32_t calls = 0;   // of a clock; draws of the event
 };
+
+// The latest draw of a place, if it is none of the event's first.
+struct Draw {
+  Caller *caller;
+  Source source;
+  const char *call;
+  std::string answer;
+};
+std::vector<Draw> &latest_draws() {
+  static auto *draws = new std::vector<Draw>;
+  return *draws;
+}
 
 // dladdr goes through all symbols of a library: once for each place.
 Caller &caller_at(const void *address) {
@@ -51,13 +76,18 @@ Caller &caller_at(const void *address) {
   Dl_info info{};
   if (!is_new || dladdr(address, &info) == 0 || info.dli_fname == nullptr) return found->second;
   const auto offset = static_cast<const char *>(address) - 1 - static_cast<char *>(info.dli_fbase);
-  if (!is_library(info)) found->second = {true, info.dli_fname, static_cast<std::uint64_t>(offset)};
+  if (!is_library(info)) found->second = {true, 0, info.dli_fname, static_cast<std::uint64_t>(offset)};
   return found->second;
 }
 
 void write_frame(Writer &body, const Caller &caller) {
   body.text(caller.file);
   body.number(caller.offset);
+}
+
+void write_caller(Writer &body, const Caller &caller) {
+  body.number(1U);
+  write_frame(body, caller);
 }
 
 // The frames of the program's own code, innermost first.
@@ -76,28 +106,81 @@ void write_stack(Writer &body) {
 
 bool is_own_code(const void *caller) { return self != nullptr && linked() && caller_at(caller).own; }
 
-void note_answer(Source source, const char *call, const std::string &answer, const void *caller) {
+namespace {
+
+Writer start_of_record(Source source, std::uint32_t calls, const char *call, const std::string &answer) {
+  Writer body;
+  body.number(static_cast<std::uint32_t>(source));
+  body.number(calls);
+  body.text(call);
+  body.text(answer);
+  return body;
+}
+
+void begin_event(Caller &caller) {
+  const auto now = static_cast<std::uint32_t>(times_let_go());
+  if (std::exchange(caller.event, now) != now) caller.calls = 0;
+}
+
+void keep_latest(Draw draw) {
+  auto &draws = latest_draws();
+  for (Draw &one : draws)
+    if (one.caller == draw.caller) return std::swap(one, draw);
+  draws.push_back(std::move(draw));
+}
+
+}  // namespace
+
+void note_answer(Source source, const char *call, const std::string &answer, const void *where) {
   static std::uint64_t event = 0;
   static std::uint32_t noted = 0;
   Thread *thread = me();
   if (thread == nullptr) return;
   const Inside inside(*thread);
+  Caller &caller = caller_at(where);
+  const bool is_clock = source == Source::CLOCK;
+  if (!is_clock) begin_event(caller);
   // Clocks are looked at often, and show what the event's time is.
-  if (source == Source::CLOCK && ++caller_at(caller).looks > LOOKS_FIRST) return;
+  if (++caller.calls > LOOKS_FIRST && is_clock) return;
+  if (caller.calls > DRAWS_FIRST && !is_clock) return keep_latest({&caller, source, call, answer});
   if (event != times_let_go()) noted = 0;
   event = times_let_go();
   if (++noted > NOTES_PER_EVENT) return;
-  Writer body;
-  body.number(static_cast<std::uint32_t>(source));
-  body.text(call);
-  body.text(answer);
-  if (source == Source::CLOCK) {
-    body.number(1U);
-    write_frame(body, caller_at(caller));
+  Writer body = start_of_record(source, 1, call, answer);
+  if (is_clock) {
+    write_caller(body, caller);
   } else {
     write_stack(body);
   }
   say(Say::DRAW, body);
+}
+
+void note_variable(const char *name, const char *value, const void *where) {
+  Thread *thread = me();
+  if (thread == nullptr || has_python()) return;  // which reads many as it starts
+  const Inside inside(*thread);
+  Caller &caller = caller_at(where);
+  begin_event(caller);
+  if (++caller.calls > DRAWS_FIRST) return;
+  Writer body;
+  body.bytes.reserve(VARIABLE_BYTES);  // as for paths
+  body.number(static_cast<std::uint32_t>(Source::VARIABLE));
+  body.number(1U);
+  body.blob(name, strnlen(name, VARIABLE_BYTES / 8));
+  body.number(value == nullptr ? 0U : 1U);
+  body.blob(value, value == nullptr ? 0 : strnlen(value, VARIABLE_BYTES / 8));
+  write_stack(body);
+  say(Say::DRAW, body);
+}
+
+void note_latest_draws() {
+  for (const Draw &draw : latest_draws()) {
+    const std::string answer = "call " + std::to_string(draw.caller->calls) + ": " + draw.answer;
+    Writer body = start_of_record(draw.source, draw.caller->calls - DRAWS_FIRST, draw.call, answer);
+    write_caller(body, *draw.caller);
+    say(Say::DRAW, body);
+  }
+  latest_draws().clear();
 }
 
 void write_maker(Writer &body, const void *caller) {
@@ -149,4 +232,11 @@ RSLTRACE_EXPORT pid_t getpid() noexcept {
   const pid_t number = REAL(getpid)();
   RSLTRACE_NOTE(Source::PID, "getpid()", std::to_string(number));
   return number;
+}
+
+RSLTRACE_EXPORT char *getenv(const char *name) noexcept {
+  char *const value = REAL(getenv)(name);
+  const void *caller = __builtin_return_address(0);
+  if (is_own_code(caller)) note_variable(name, value, caller);
+  return value;
 }

@@ -3,6 +3,7 @@
 #include <stdio.h>
 #include <sys/resource.h>
 #include <sys/time.h>
+#include <sys/timeb.h>
 #include <sys/times.h>
 #include <time.h>
 #include <unistd.h>
@@ -123,6 +124,17 @@ RSLTRACE_EXPORT time_t time(time_t *out) noexcept {
   if (out != nullptr) *out = now.tv_sec;
   RSLTRACE_NOTE(Source::CLOCK, "time()", std::to_string(now.tv_sec));
   return now.tv_sec;
+}
+
+RSLTRACE_EXPORT int ftime(timeb *out) {
+  using Function = int(timeb *);
+  static auto *libc = reinterpret_cast<Function *>(real("ftime"));  // REAL: its header warns of it
+  if (!linked()) return libc(out);
+  timespec now;
+  clock_gettime(CLOCK_REALTIME, &now);
+  *out = {now.tv_sec, static_cast<unsigned short>(now.tv_nsec / 1'000'000), 0, 0};
+  RSLTRACE_NOTE(Source::CLOCK, "ftime()", shown(now));
+  return 0;
 }
 
 RSLTRACE_EXPORT int timespec_get(timespec *out, int base) noexcept {

@@ -17,6 +17,7 @@
 #include <algorithm>
 #include <string_view>
 
+#include "call_sites.h"
 #include "endpoints.h"
 #include "entropy.h"
 #include "guard_conditions.h"
@@ -284,6 +285,7 @@ void idle(Waiter *const *waiters, std::size_t count, bool outside) {
   pacer.deadline_ns = time_ns + PACE_NS;
   pacer.what = "a call that blocks outside";
   if (outside) told.push_back(&pacer);
+  note_latest_draws();
   say_wait(told);
   send_batch();
   const Message message = listen();

@@ -1,4 +1,5 @@
 // Calls of the kernel by their numbers, past the functions of libc: the same as by those.
+#include <fcntl.h>
 #include <sched.h>
 #include <sys/random.h>
 #include <sys/resource.h>
@@ -55,7 +56,9 @@ RSLTRACE_EXPORT long syscall(long number, ...) noexcept {
     case SYS_getcpu:
     case SYS_getrusage:
     case SYS_gettimeofday:
+    case SYS_openat:
 #ifdef SYS_time
+    case SYS_open:
     case SYS_time:
 #endif
     case SYS_times: thread = me(); break;
@@ -75,7 +78,10 @@ RSLTRACE_EXPORT long syscall(long number, ...) noexcept {
       case SYS_getcpu: return getcpu(as<unsigned *>(a[0]), as<unsigned *>(a[1]));
       case SYS_getrusage: return getrusage(static_cast<__rusage_who_t>(a[0]), as<rusage *>(a[1]));
       case SYS_gettimeofday: return gettimeofday(as<timeval *>(a[0]), as<void *>(a[1]));
-#ifdef SYS_time
+      case SYS_openat: return openat(static_cast<int>(a[0]), as<const char *>(a[1]), static_cast<int>(a[2]),
+                                     static_cast<mode_t>(a[3]));
+#ifdef SYS_time  // and other calls that newer machines do not have
+      case SYS_open: return open(as<const char *>(a[0]), static_cast<int>(a[1]), static_cast<mode_t>(a[2]));
       case SYS_time: return time(as<time_t *>(a[0]));
 #endif
       case SYS_times: return times(as<tms *>(a[0]));
