@@ -681,7 +681,7 @@ void refuse(PyObject *object, PyTypeObject *type, const PyMemberDef *fields, siz
 }
 
 static int is_publisher(PyObject *object) {
-  const size_t first = (offsetof(Entity, dispatcher) - sizeof(PyObject)) / sizeof(PyObject *);
+  const size_t first = FIELD_PLACE(Entity, dispatcher);
   return has_fields(object, entity_type, &publisher_seen, entity_fields, first,
                     FIELD_COUNT(Entity));
 }
@@ -796,14 +796,14 @@ static int end_event(Dispatcher *self) {
   event = (Event *)Py_NewRef(self->event);
   loop = (Loop *)Py_NewRef(self->loop);
   recorder = Py_NewRef(self->recorder);
-  if (HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop)) {
+  if (HAS_FIELD(event, Event, event, node)) {
     node = Py_NewRef(event->node);
     state_hash = state_hash_of(node);
     Py_DECREF(node);
   }
-  if (state_hash != NULL && HAS_FIELDS(self, Dispatcher, dispatcher) &&
-      HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop) &&
-      record_end(self, recorder, loop, event, state_hash) == 0 && HAS_FIELDS(loop, Loop, loop) &&
+  if (state_hash != NULL && HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop) &&
+      record_end(self, recorder, loop, event, state_hash) == 0 &&
+      HAS_FIELD(loop, Loop, loop, events) &&
       add_one(&loop->events) == 0 && set(&event->flags, Py_NewRef(zero)) == 0 &&
       set(&event->quiet, Py_NewRef(Py_False)) == 0 && tell_observers(self) == 0)
     failed = 0;
@@ -825,14 +825,14 @@ enum { HANDLE, ENTITY, NODE, KIND, CALLBACK, ARGS, CAUSE_EVENT, CAUSE_OUTPUT, IN
 static int run_event(Dispatcher *self, PyObject *const *call, int has_one) {
   static const int begins[] = {HANDLE, ENTITY, NODE, KIND, CAUSE_EVENT, CAUSE_OUTPUT, INPUT_HASH};
   int failed;
-  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || !HAS_FIELDS(self->event, Event, event))
+  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || !HAS_FIELD(self->event, Event, event, handle))
     return -1;
   Event *event = (Event *)Py_NewRef(self->event);
   PyObject *caller = Py_NewRef(has_one ? self->call_back_with : self->call_back);
   for (int i = 0; i < 7; ++i) set(&event->handle + i, Py_NewRef(call[begins[i]]));
   failed = done(PyObject_CallFunctionObjArgs(caller, self, call[HANDLE], call[CALLBACK], call[ARGS],
                                              NULL)) < 0 ||
-           end_event(self) < 0 || !HAS_FIELDS(event, Event, event);
+           end_event(self) < 0 || !HAS_FIELD(event, Event, event, on_end);
   Py_DECREF(caller);
   if (!failed && event->on_end != Py_None) {
     PyObject *on_end = event->on_end;
@@ -1025,8 +1025,8 @@ static int is_site_due(Entity *self) {
   Sites *sites = (Sites *)self->sites;
   PyObject *entity, *running;
   uint64_t count, due_at;
-  if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher) ||
-      !HAS_FIELDS(dispatcher->event, Event, event) || !HAS_FIELDS(sites, Sites, sites) ||
+  if (!HAS_FIELD(dispatcher, Dispatcher, dispatcher, event) ||
+      !HAS_FIELD(dispatcher->event, Event, event, entity) || !HAS_FIELDS(sites, Sites, sites) ||
       read_number(self->count, &count) < 0 || read_number(sites->due, &due_at) < 0)
     return -1;
   if (count == due_at) return 1;
@@ -1061,24 +1061,15 @@ static PyMethodDef no_methods[] = {{NULL, NULL, 0, NULL}};
 
 /* -- Subscription ------------------------------------------------------------------------------- */
 
-/* Looks among the object's own attributes first, where those asked for are: this is much faster. */
-static PyObject *attribute(PyObject *object, PyObject *name) {
-  PyObject *own = PyObject_GenericGetDict(object, NULL);
-  PyObject *found = own == NULL ? NULL : Py_XNewRef(PyDict_GetItemWithError(own, name));
-  Py_XDECREF(own);
-  if (found == NULL) PyErr_Clear();
-  return found != NULL ? found : PyObject_GetAttr(object, name);
-}
-
 /* Whether an attribute is an object; -1 with an error. */
 static int has(PyObject *object, PyObject *name, PyObject *wanted) {
-  PyObject *found = attribute(object, name);
+  PyObject *found = PyObject_GetAttr(object, name);
   Py_XDECREF(found);
   return found == NULL ? -1 : found == wanted;
 }
 
 static int is_free(PyObject *wrapper) {
-  PyObject *group = attribute(wrapper, callback_group);
+  PyObject *group = PyObject_GetAttr(wrapper, callback_group);
   const int free = group == NULL ? -1 : has(group, active_entity, Py_None);
   Py_XDECREF(group);
   return free;

@@ -69,6 +69,8 @@ extern PyMemberDef loop_fields[], event_fields[], dispatcher_fields[], entity_fi
 
 #define FIELD_COUNT(Struct) ((sizeof(Struct) - sizeof(PyObject)) / sizeof(PyObject *))
 
+#define FIELD_PLACE(Struct, field) ((offsetof(Struct, field) - sizeof(PyObject)) / sizeof(PyObject *))
+
 #define OBJECTS(prefix, count)                                                       \
   static int prefix##_traverse(PyObject *self, visitproc visit, void *arg) {         \
     Py_VISIT(Py_TYPE(self));                                                         \
@@ -136,6 +138,10 @@ static inline __attribute__((always_inline)) int has_fields(
 #define HAS_FIELDS(object, Struct, prefix) \
   has_fields((PyObject *)(object), prefix##_type, &prefix##_seen, prefix##_fields, 0, \
              FIELD_COUNT(Struct))
+
+#define HAS_FIELD(object, Struct, prefix, field) \
+  has_fields((PyObject *)(object), prefix##_type, &prefix##_seen, prefix##_fields, \
+             FIELD_PLACE(Struct, field), FIELD_PLACE(Struct, field) + 1)
 
 /* Replaces a field by a new object, or fails if there is none. */
 int set(PyObject **field, PyObject *value);

@@ -166,6 +166,8 @@ class Run:
             log.append((type(error_), str(error_).split("'")[-2:][0][:6]))
             self.dispatcher.event.on_end = None
         finally:
+            if not hasattr(self.dispatcher.event, "on_end"):  # something else has been raised first
+                self.dispatcher.event.on_end = None
             if is_steered:
                 self.dispatcher.remove_observer(self.asking)
 
