@@ -596,11 +596,12 @@ PyTypeObject *event_type, *dispatcher_type, *entity_type, *timers_type;
 /* Subclasses: see is_a. */
 PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen, *timers_seen;
 PyObject *deque_type;
-static PyTypeObject *sites_type, *chain_type, *timer_type;
+static PyTypeObject *sites_type, *chain_type, *timer_type, *subscription_type;
 static PyObject *sites_seen, *timer_seen, *publisher_seen, *node_seen, *chain_seen;
 static PyObject *hash64, *zero;
-static PyCFunction deque_append, deque_popleft;
-static PyObject *call_back, *heapreplace, *no_event, *no_args;
+PyCFunction deque_popleft;
+static PyCFunction deque_append;
+static PyObject *dispatch_name, *dispatch_usual, *heapreplace, *no_event, *no_args;
 static PyObject *callback_group, *active_entity, *user_callback, *timer_callback, *raw, *admitted;
 
 typedef struct {
@@ -616,18 +617,12 @@ FIELDS(TimerState, timer, "TimerStateFields")
 FIELDS(TimerQueue, timers, "TimerQueueFields")
 
 PyMemberDef event_fields[] = {
-    FIELD(Event, handle, "handle"),
-    FIELD(Event, entity, "entity"),
-    FIELD(Event, node, "node"),
-    FIELD(Event, kind, "kind"),
-    FIELD(Event, cause_event, "cause_event"),
-    FIELD(Event, cause_output, "cause_output"),
-    FIELD(Event, input_hash, "input_hash"),
-    FIELD(Event, flags, "flags"),
-    FIELD(Event, quiet, "quiet"),
-    FIELD(Event, busy_ns, "busy_ns"),
-    FIELD(Event, on_end, "on_end"),
-    NO_FIELD,
+    FIELD(Event, handle, "handle"), FIELD(Event, entity, "entity"),
+    FIELD(Event, node, "node"), FIELD(Event, kind, "kind"),
+    FIELD(Event, cause_event, "cause_event"), FIELD(Event, cause_output, "cause_output"),
+    FIELD(Event, input_hash, "input_hash"), FIELD(Event, flags, "flags"),
+    FIELD(Event, quiet, "quiet"), FIELD(Event, busy_ns, "busy_ns"),
+    FIELD(Event, on_end, "on_end"), NO_FIELD,
 };
 
 static PyMemberDef sites_fields[] = {
@@ -654,36 +649,25 @@ PyMemberDef dispatcher_fields[] = {
     FIELD(Dispatcher, pending, "_pending"),
     FIELD(Dispatcher, before, "_before"),
     FIELD(Dispatcher, after, "_after"),
+    FIELD(Dispatcher, call_back, "_call_back"),
+    FIELD(Dispatcher, call_back_with, "_call_back_with"),
     NO_FIELD,
 };
 
 PyMemberDef entity_fields[] = {
-    FIELD(Entity, active, "active"),
-    FIELD(Entity, state, "state"),
-    FIELD(Entity, queue, "queue"),
-    FIELD(Entity, keep, "keep"),
-    FIELD(Entity, node, "node"),
-    FIELD(Entity, destroyed, "destroyed"),
-    FIELD(Entity, wrapper, "wrapper"),
-    FIELD(Entity, own_group, "own_group"),
-    FIELD(Entity, mailbox, "mailbox"),
-    FIELD(Entity, callback, "_callback"),
-    FIELD(Entity, coroutine, "_coroutine"),
-    FIELD(Entity, with_info, "_with_info"),
-    FIELD(Entity, deserialize, "_deserialize"),
-    FIELD(Entity, serialize, "_serialize"),
-    FIELD(Entity, sites, "_sites"),
-    FIELD(Entity, dispatcher, "dispatcher"),
-    FIELD(Entity, entity_id, "entity_id"),
-    FIELD(Entity, subscriptions, "subscriptions"),
-    FIELD(Entity, links, "links"),
-    FIELD(Entity, observers, "observers"),
-    FIELD(Entity, count, "_count"),
-    FIELD(Entity, channel, "_channel"),
-    FIELD(Entity, output_kind, "_output_kind"),
-    FIELD(Entity, history, "_history"),
-    FIELD(Entity, offers, "_offers"),
-    FIELD(Entity, faults, "_faults"),
+    FIELD(Entity, active, "active"), FIELD(Entity, state, "state"),
+    FIELD(Entity, queue, "queue"), FIELD(Entity, keep, "keep"),
+    FIELD(Entity, node, "node"), FIELD(Entity, destroyed, "destroyed"),
+    FIELD(Entity, wrapper, "wrapper"), FIELD(Entity, own_group, "own_group"),
+    FIELD(Entity, mailbox, "mailbox"), FIELD(Entity, callback, "_callback"),
+    FIELD(Entity, coroutine, "_coroutine"), FIELD(Entity, with_info, "_with_info"),
+    FIELD(Entity, deserialize, "_deserialize"), FIELD(Entity, serialize, "_serialize"),
+    FIELD(Entity, sites, "_sites"), FIELD(Entity, dispatcher, "dispatcher"),
+    FIELD(Entity, entity_id, "entity_id"), FIELD(Entity, subscriptions, "subscriptions"),
+    FIELD(Entity, links, "links"), FIELD(Entity, observers, "observers"),
+    FIELD(Entity, count, "_count"), FIELD(Entity, channel, "_channel"),
+    FIELD(Entity, output_kind, "_output_kind"), FIELD(Entity, history, "_history"),
+    FIELD(Entity, offers, "_offers"), FIELD(Entity, faults, "_faults"),
     NO_FIELD,
 };
 
@@ -697,7 +681,7 @@ void refuse(PyObject *object, PyTypeObject *type, const PyMemberDef *fields, siz
 }
 
 static int is_publisher(PyObject *object) {
-  const size_t first = (offsetof(Entity, dispatcher) - sizeof(PyObject)) / sizeof(PyObject *);
+  const size_t first = FIELD_PLACE(Entity, dispatcher);
   return has_fields(object, entity_type, &publisher_seen, entity_fields, first,
                     FIELD_COUNT(Entity));
 }
@@ -812,14 +796,14 @@ static int end_event(Dispatcher *self) {
   event = (Event *)Py_NewRef(self->event);
   loop = (Loop *)Py_NewRef(self->loop);
   recorder = Py_NewRef(self->recorder);
-  if (HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop)) {
+  if (HAS_FIELD(event, Event, event, node)) {
     node = Py_NewRef(event->node);
     state_hash = state_hash_of(node);
     Py_DECREF(node);
   }
-  if (state_hash != NULL && HAS_FIELDS(self, Dispatcher, dispatcher) &&
-      HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop) &&
-      record_end(self, recorder, loop, event, state_hash) == 0 && HAS_FIELDS(loop, Loop, loop) &&
+  if (state_hash != NULL && HAS_FIELDS(event, Event, event) && HAS_FIELDS(loop, Loop, loop) &&
+      record_end(self, recorder, loop, event, state_hash) == 0 &&
+      HAS_FIELD(loop, Loop, loop, events) &&
       add_one(&loop->events) == 0 && set(&event->flags, Py_NewRef(zero)) == 0 &&
       set(&event->quiet, Py_NewRef(Py_False)) == 0 && tell_observers(self) == 0)
     failed = 0;
@@ -838,17 +822,18 @@ enum { HANDLE, ENTITY, NODE, KIND, CALLBACK, ARGS, CAUSE_EVENT, CAUSE_OUTPUT, IN
 
 /* What calls the callback is Python, as who looks at the stack finds its frame there, and what a
    callback raises passes through it. */
-static int run_event(Dispatcher *self, PyObject *const *call) {
+static int run_event(Dispatcher *self, PyObject *const *call, int has_one) {
   static const int begins[] = {HANDLE, ENTITY, NODE, KIND, CAUSE_EVENT, CAUSE_OUTPUT, INPUT_HASH};
-  Event *event;
   int failed;
-  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || !HAS_FIELDS(self->event, Event, event))
+  if (!HAS_FIELDS(self, Dispatcher, dispatcher) || !HAS_FIELD(self->event, Event, event, handle))
     return -1;
-  event = (Event *)Py_NewRef(self->event);
+  Event *event = (Event *)Py_NewRef(self->event);
+  PyObject *caller = Py_NewRef(has_one ? self->call_back_with : self->call_back);
   for (int i = 0; i < 7; ++i) set(&event->handle + i, Py_NewRef(call[begins[i]]));
-  failed = done(PyObject_CallMethodObjArgs((PyObject *)self, call_back, call[HANDLE],
-                                           call[CALLBACK], call[ARGS], NULL)) < 0 ||
-           end_event(self) < 0 || !HAS_FIELDS(event, Event, event);
+  failed = done(PyObject_CallFunctionObjArgs(caller, self, call[HANDLE], call[CALLBACK], call[ARGS],
+                                             NULL)) < 0 ||
+           end_event(self) < 0 || !HAS_FIELD(event, Event, event, on_end);
+  Py_DECREF(caller);
   if (!failed && event->on_end != Py_None) {
     PyObject *on_end = event->on_end;
     event->on_end = Py_NewRef(Py_None);
@@ -859,21 +844,25 @@ static int run_event(Dispatcher *self, PyObject *const *call) {
   return failed ? -1 : 0;
 }
 
-static int execute(Dispatcher *self, PyObject *const *call, int is_decided) {
+/* With ``has_one``, ARGS is the only argument, and no tuple. */
+static int execute(Dispatcher *self, PyObject *const *call, int has_one, int is_decided) {
   const int is_steered = is_decided || self->before == NULL ? 0 : PyObject_IsTrue(self->before);
-  if (is_steered == 0) return run_event(self, call);
+  if (is_steered == 0) return run_event(self, call, has_one);
   if (is_steered < 0) return -1;
-  return done(PyObject_CallMethod((PyObject *)self, "ask_and_execute", "OOOOOOOOO", call[HANDLE],
-                                  call[ENTITY], call[NODE], call[KIND], call[CALLBACK],
-                                  call[ARGS], call[CAUSE_EVENT], call[CAUSE_OUTPUT],
-                                  call[INPUT_HASH]));
+  return done(PyObject_CallMethod((PyObject *)self, "ask_and_execute",
+                                  has_one ? "OOOOO(O)OOO" : "OOOOOOOOO", call[HANDLE], call[ENTITY],
+                                  call[NODE], call[KIND], call[CALLBACK], call[ARGS],
+                                  call[CAUSE_EVENT], call[CAUSE_OUTPUT], call[INPUT_HASH]));
 }
 
 static PyObject *dispatcher_execute(Dispatcher *self, PyObject *const *args, Py_ssize_t count) {
-  int is_decided;
+  PyObject *call[CALL];
   if (check_count("execute", count, CALL, CALL + 1) < 0) return NULL;
-  is_decided = count > CALL ? PyObject_IsTrue(args[CALL]) : 0;
-  if (is_decided < 0 || execute(self, args, is_decided) < 0) return NULL;
+  memcpy(call, args, sizeof call);
+  const int has_one = PyTuple_Check(call[ARGS]) && PyTuple_Size(call[ARGS]) == 1;
+  if (has_one) call[ARGS] = PyTuple_GetItem(call[ARGS], 0);
+  const int is_decided = count > CALL ? PyObject_IsTrue(args[CALL]) : 0;
+  if (is_decided < 0 || execute(self, call, has_one, is_decided) < 0) return NULL;
   Py_RETURN_NONE;
 }
 
@@ -1036,8 +1025,8 @@ static int is_site_due(Entity *self) {
   Sites *sites = (Sites *)self->sites;
   PyObject *entity, *running;
   uint64_t count, due_at;
-  if (!HAS_FIELDS(dispatcher, Dispatcher, dispatcher) ||
-      !HAS_FIELDS(dispatcher->event, Event, event) || !HAS_FIELDS(sites, Sites, sites) ||
+  if (!HAS_FIELD(dispatcher, Dispatcher, dispatcher, event) ||
+      !HAS_FIELD(dispatcher->event, Event, event, entity) || !HAS_FIELDS(sites, Sites, sites) ||
       read_number(self->count, &count) < 0 || read_number(sites->due, &due_at) < 0)
     return -1;
   if (count == due_at) return 1;
@@ -1129,8 +1118,8 @@ static int is_admitted(Entity *self) {
   return is_it;
 }
 
-/* Runs a callback; ``cause`` has the event, its output and the hash of the input. */
-static int run_callback(Entity *self, long number, PyObject *callback, PyObject *args,
+/* Runs a callback (see execute); ``cause`` has the event, its output and the hash of the input. */
+static int run_callback(Entity *self, long number, PyObject *callback, PyObject *args, int has_one,
                         PyObject *const *cause) {
   PyObject *kind = PyLong_FromLong(number);
   PyObject *entity = Py_XNewRef(self->entity_id), *node = Py_XNewRef(self->node);
@@ -1141,7 +1130,7 @@ static int run_callback(Entity *self, long number, PyObject *callback, PyObject 
   } else if (kind != NULL && HAS_FIELDS(dispatcher, Dispatcher, dispatcher)) {
     PyObject *call[CALL] = {(PyObject *)self, entity,   node,     kind,    callback,
                             args,             cause[0], cause[1], cause[2]};
-    failed = execute(dispatcher, call, 0);
+    failed = execute(dispatcher, call, has_one, 0);
   }
   Py_XDECREF(dispatcher);
   Py_XDECREF(node);
@@ -1153,14 +1142,11 @@ static int run_callback(Entity *self, long number, PyObject *callback, PyObject 
 /* Runs the callback for a delivery of the middleware (subscription.Delivery). */
 static int run_subscription(Entity *self, PyObject *delivery) {
   PyObject *callback = Py_NewRef(self->callback), *deserialize = Py_NewRef(self->deserialize);
-  PyObject *message, *args, *cause[3];
-  int failed = 1;
-  message = call_one(deserialize, PyTuple_GetItem(delivery, 4));
-  args = message == NULL ? NULL : PyTuple_Pack(1, message);
-  Py_XDECREF(message);
+  PyObject *message = call_one(deserialize, PyTuple_GetItem(delivery, 4)), *cause[3];
   for (int i = 0; i < 3; ++i) cause[i] = PyTuple_GetItem(delivery, 5 + i);
-  if (args != NULL) failed = run_callback(self, SUBSCRIPTION, callback, args, cause);
-  Py_XDECREF(args);
+  const int failed =
+      message == NULL || run_callback(self, SUBSCRIPTION, callback, message, 1, cause);
+  Py_XDECREF(message);
   Py_DECREF(deserialize);
   Py_DECREF(callback);
   return failed;
@@ -1189,6 +1175,20 @@ static PyMethodDef subscription_methods[] = {
     {"dispatch", (PyCFunction)subscription_dispatch, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
+
+/* Runs what is ready. ``seen`` is the last class whose method is the one above: to call that from
+   here is faster than as a method. */
+int dispatch(PyObject *item) {
+  static PyObject *seen;
+  PyObject *type = (PyObject *)Py_TYPE(item), *method;
+  if (type != seen && PyType_IsSubtype((PyTypeObject *)type, subscription_type)) {
+    method = PyObject_GetAttr(type, dispatch_name);
+    if (method == dispatch_usual) set(&seen, Py_NewRef(type));
+    if (done(method) < 0) return -1;
+  }
+  return done(type == seen ? subscription_dispatch((Entity *)item, NULL)
+                           : PyObject_CallMethodObjArgs(item, dispatch_name, NULL));
+}
 
 /* -- Timer -------------------------------------------------------------------------------------- */
 
@@ -1268,7 +1268,7 @@ static PyObject *timer_dispatch(Entity *self, PyObject *Py_UNUSED(none)) {
            set(&state->deadline_ns, Py_NewRef(next)) < 0 ||
            set(&state->ticket, Py_NewRef(entry)) < 0 ||
            done(call_two(heapreplace, heap, entry)) < 0 ||
-           find_first(queue, heap) < 0 || run_callback(self, TIMER, callback, no_args, cause);
+           find_first(queue, heap) < 0 || run_callback(self, TIMER, callback, no_args, 0, cause);
   Py_DECREF(queue);
   Py_DECREF(callback);
   Py_DECREF(heap);
@@ -1307,7 +1307,7 @@ static int add_types(PyObject *module) {
   no_event = PyLong_FromUnsignedLongLong(U64);
   no_args = PyTuple_New(0);
   zero = PyLong_FromLong(0);
-  call_back = PyUnicode_InternFromString("call_back");
+  dispatch_name = PyUnicode_InternFromString("dispatch");
   callback_group = PyUnicode_InternFromString("callback_group");
   active_entity = PyUnicode_InternFromString("_active_entity");
   user_callback = PyUnicode_InternFromString("_callback");
@@ -1324,11 +1324,13 @@ static int add_types(PyObject *module) {
   sites_type = sites_made(sites_fields, no_methods);
   timer_type = timer_made(timer_fields, no_methods);
   timers_type = timers_made(timers_fields, no_methods);
+  subscription_type = entity_with(subscription_methods, "rsltrace._core.SubscriptionFields");
+  if (PyErr_Occurred()) return -1;
+  dispatch_usual = PyObject_GetAttr((PyObject *)subscription_type, dispatch_name);
   PyTypeObject *all[] = {
       buffer_type, chain_type, event_type, dispatcher_type, entity_type, sites_type, timer_type,
-      timers_type,
+      timers_type, subscription_type,
       entity_with(publisher_methods, "rsltrace._core.PublisherFields"),
-      entity_with(subscription_methods, "rsltrace._core.SubscriptionFields"),
       entity_with(timer_methods, "rsltrace._core.TimerFields"),
   };
   if (PyErr_Occurred()) return -1;

@@ -25,7 +25,7 @@ typedef struct {
 typedef struct {
   Loop of_events;
   PyObject *tasks, *idle, *scheduled, *timers, *places, *gate, *min_step_ns;
-  PyObject *looks_at, *until_events, *quiet_ns;
+  PyObject *looks_at, *until_events, *quiet_ns, *interrupt;
 } WholeLoop;
 
 typedef struct {
@@ -37,6 +37,7 @@ typedef struct {
 typedef struct {
   PyObject_HEAD
   PyObject *loop, *event, *entities, *recorder, *unrecorded, *pending, *before, *after;
+  PyObject *call_back, *call_back_with;
 } Dispatcher;
 
 typedef struct {
@@ -63,9 +64,12 @@ typedef struct {
 extern PyTypeObject *loop_type, *event_type, *dispatcher_type, *entity_type, *timers_type;
 extern PyObject *loop_seen, *event_seen, *dispatcher_seen, *subscription_seen, *timers_seen;
 extern PyObject *deque_type;
+extern PyCFunction deque_popleft;
 extern PyMemberDef loop_fields[], event_fields[], dispatcher_fields[], entity_fields[];
 
 #define FIELD_COUNT(Struct) ((sizeof(Struct) - sizeof(PyObject)) / sizeof(PyObject *))
+
+#define FIELD_PLACE(Struct, field) ((offsetof(Struct, field) - sizeof(PyObject)) / sizeof(PyObject *))
 
 #define OBJECTS(prefix, count)                                                       \
   static int prefix##_traverse(PyObject *self, visitproc visit, void *arg) {         \
@@ -135,6 +139,10 @@ static inline __attribute__((always_inline)) int has_fields(
   has_fields((PyObject *)(object), prefix##_type, &prefix##_seen, prefix##_fields, 0, \
              FIELD_COUNT(Struct))
 
+#define HAS_FIELD(object, Struct, prefix, field) \
+  has_fields((PyObject *)(object), prefix##_type, &prefix##_seen, prefix##_fields, \
+             FIELD_PLACE(Struct, field), FIELD_PLACE(Struct, field) + 1)
+
 /* Replaces a field by a new object, or fails if there is none. */
 int set(PyObject **field, PyObject *value);
 
@@ -153,6 +161,7 @@ PyObject *call_two(PyObject *callable, PyObject *first, PyObject *second);
 int done(PyObject *result);
 int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_ssize_t most);
 int append_to(PyObject *queue, PyObject *item);
+int dispatch(PyObject *item);
 int record_draw(PyObject *recorder, PyObject *entity, unsigned long long draw);
 
 /* Puts an arrival into the queue of its receiver; returns whether that is ready for it now. */

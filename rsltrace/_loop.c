@@ -20,21 +20,14 @@ FIELDS(WholeLoop, loop, "LoopFields")
 FIELDS(Link, link, "LinkFields")
 
 PyMemberDef loop_fields[] = {
-    FIELD(Loop, now_ns, "now_ns"),
-    FIELD(Loop, events, "events"),
-    FIELD(Loop, activity_ns, "activity_ns"),
-    FIELD(Loop, ready, "ready"),
-    FIELD(WholeLoop, tasks, "tasks"),
-    FIELD(WholeLoop, idle, "idle"),
-    FIELD(WholeLoop, scheduled, "scheduled"),
-    FIELD(WholeLoop, timers, "timers"),
-    FIELD(WholeLoop, places, "places"),
-    FIELD(WholeLoop, gate, "gate"),
-    FIELD(WholeLoop, min_step_ns, "min_step_ns"),
-    FIELD(WholeLoop, looks_at, "looks_at"),
-    FIELD(WholeLoop, until_events, "_until_events"),
-    FIELD(WholeLoop, quiet_ns, "_quiet_ns"),
-    NO_FIELD,
+    FIELD(Loop, now_ns, "now_ns"), FIELD(Loop, events, "events"),
+    FIELD(Loop, activity_ns, "activity_ns"), FIELD(Loop, ready, "ready"),
+    FIELD(WholeLoop, tasks, "tasks"), FIELD(WholeLoop, idle, "idle"),
+    FIELD(WholeLoop, scheduled, "scheduled"), FIELD(WholeLoop, timers, "timers"),
+    FIELD(WholeLoop, places, "places"), FIELD(WholeLoop, gate, "gate"),
+    FIELD(WholeLoop, min_step_ns, "min_step_ns"), FIELD(WholeLoop, looks_at, "looks_at"),
+    FIELD(WholeLoop, until_events, "_until_events"), FIELD(WholeLoop, quiet_ns, "_quiet_ns"),
+    FIELD(WholeLoop, interrupt, "_interrupt"), NO_FIELD,
 };
 
 static PyMemberDef link_fields[] = {
@@ -253,7 +246,43 @@ static PyObject *loop_next_arrival(WholeLoop *self, PyObject *Py_UNUSED(none)) {
   return first;
 }
 
+/* Dispatches time steps with one arrival; returns when the last one was, or else what it is given. */
+static PyObject *loop_run_arrivals(WholeLoop *self, PyObject *now_ns) {
+  PyObject *item = loop_next_arrival(self, NULL);
+  int failed = 0;
+  Py_INCREF(now_ns);
+  while (!failed && item != NULL && item != Py_False) {
+    failed = set(&now_ns, Py_XNewRef(self->of_events.now_ns)) < 0 ||
+             (item != Py_None && dispatch(item) < 0);
+    Py_DECREF(item);
+    item = failed ? NULL : loop_next_arrival(self, NULL);
+  }
+  if (item == NULL) Py_CLEAR(now_ns);
+  Py_XDECREF(item);
+  return now_ns;
+}
+
+/* Dispatches tasks, and what is ready, until none is left or ``limit`` events have run. */
+static PyObject *loop_run_ready(WholeLoop *self, PyObject *limit) {
+  int failed = 0;
+  while (!failed && HAS_FIELDS(self, WholeLoop, loop)) {
+    PyObject *tasks = self->tasks, *ready = self->of_events.ready, *item;
+    uint64_t events, most;
+    if ((PyObject *)Py_TYPE(ready) != deque_type || (PyObject *)Py_TYPE(tasks) != deque_type)
+      return PyObject_CallMethod((PyObject *)self, "python_run_ready", "(O)", limit);
+    if (read_number(self->of_events.events, &events) < 0 || read_number(limit, &most) < 0) break;
+    if (PyObject_Size(tasks)) ready = tasks;
+    if (self->interrupt != Py_False || events >= most || PyObject_Size(ready) == 0) Py_RETURN_NONE;
+    item = deque_popleft(ready, NULL);
+    failed = set(&self->looks_at, Py_NewRef(limit)) < 0 || item == NULL || dispatch(item) < 0;
+    Py_XDECREF(item);
+  }
+  return NULL;
+}
+
 static PyMethodDef loop_methods[] = {
+    {"run_arrivals", (PyCFunction)loop_run_arrivals, METH_O, NULL},
+    {"run_ready", (PyCFunction)loop_run_ready, METH_O, NULL},
     {"next_arrival", (PyCFunction)loop_next_arrival, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };

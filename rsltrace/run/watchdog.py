@@ -114,7 +114,7 @@ class Watchdog:
             return False  # a debugger stands still on purpose
         if frames and in_import(frames[0], _NO_PACKAGES):
             return False  # importing a large library takes time
-        in_event = any(frame.f_code is Dispatcher.call_back.__code__ for frame in frames)
+        in_event = any(frame.f_code in _CALLS for frame in frames)
         handle = domain.event.handle if in_event else None
         who = "the run, outside of any callback," if handle is None else handle.describe()
         place = next((f for f in frames if is_user_file(f.f_code.co_filename)), None)
@@ -127,6 +127,9 @@ class Watchdog:
             f"stands still at {format_seconds(domain.loop.stamp)} s{where}. Ctrl-C ends the run"
         )
         return True
+
+
+_CALLS = (Dispatcher.call_back.__code__, Dispatcher.call_back_with.__code__)
 
 
 def _frames(frame: FrameType | None) -> Iterator[FrameType]:

@@ -29,7 +29,7 @@ from rsltrace.simulation.chance.distribution import Constant, Uniform
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.stop import Stop, stop_after_events, stop_at
 from rsltrace.simulation.loop.timer_queue import TimerState, timer_queue
-from rsltrace.simulation.middleware.events.dispatcher import Dispatcher, PythonEventEnd
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher, EventEnd, PythonEventEnd
 from rsltrace.simulation.middleware.events.observer import (
     EventCall,
     EventObserver,
@@ -166,6 +166,8 @@ class Run:
             log.append((type(error_), str(error_).split("'")[-2:][0][:6]))
             self.dispatcher.event.on_end = None
         finally:
+            if not hasattr(self.dispatcher.event, "on_end"):  # something else has been raised first
+                self.dispatcher.event.on_end = None
             if is_steered:
                 self.dispatcher.remove_observer(self.asking)
 
@@ -236,6 +238,8 @@ def test_what_is_no_part_of_a_run_is_refused() -> None:
 
 class PythonLoop(EventLoop):
     next_arrival = EventLoop.python_next_arrival
+    run_arrivals = EventLoop.python_run_arrivals
+    run_ready = EventLoop.python_run_ready
 
 
 class DelayedRun:
@@ -395,7 +399,7 @@ def test_a_broken_link_or_loop_is_refused() -> None:
     names = (
         *("subscription", "_loop", "_dispatcher", "last_ns", "send", "_delay", "_arrives"),
         *("tasks", "idle", "scheduled", "timers", "places", "gate", "min_step_ns", "looks_at"),
-        *("_until_events", "_quiet_ns", "ready", "now_ns"),
+        *("_until_events", "_quiet_ns", "ready", "now_ns", "events", "_interrupt"),
     )
     for name in names:
         for broken in (None, object(), 3, [1], [()], [(1, 2)], iter(()), "x"):
@@ -422,9 +426,29 @@ def test_a_broken_link_or_loop_is_refused() -> None:
                 for _ in range(5):
                     with suppress(Exception):
                         run.loop.next_arrival()
+                    with suppress(Exception):
+                        run.loop.run_ready(run.loop.events + 1)
     del run.loop._quiet_ns
     with pytest.raises(AttributeError, match="_quiet_ns"):
         run.loop.next_arrival()
+    with pytest.raises(AttributeError, match="_quiet_ns"):
+        run.loop.run_ready(9)
+
+
+@pytest.mark.parametrize(
+    ("args", "name"), [((), "call_back"), ((1,), "call_back_with"), ((1, 2), "call_back")]
+)
+@pytest.mark.parametrize("end", [EventEnd, PythonEventEnd])
+def test_a_callback_finds_the_same_frame_above_it_compiled_or_not(
+    end: Any, args: tuple[int, ...], name: str
+) -> None:
+    found: list[Any] = []
+
+    def callback(*given: int) -> None:
+        found.extend((given, sys._getframe(1).f_code.co_name))
+
+    end.execute(DelayedRun(4, compiled=True).dispatcher, None, 0, None, 0, callback, args, 0, 0, 0)
+    assert found == [args, name]
 
 
 @needs_core

@@ -20,6 +20,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rclpy.node import Node
+from std_msgs.msg import UInt8
 
 import rsltrace
 from rsltrace.run import RunCallbacks, run, watchdog
@@ -113,6 +114,22 @@ def test_a_busy_loop_is_named_with_its_line(
     first = next(n for n, line in enumerate(lines, 1) if "def __call__" in line)
     places = [f"{__file__}:{n} in __call__" for n in range(first, first + 11)]
     assert any(place in said for place in places), said
+
+
+def test_a_busy_subscription_is_named(
+    busy: Looks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Busy(Node):
+        def __init__(self) -> None:
+            super().__init__("busy")
+            publisher = self.create_publisher(UInt8, "/numbers", 1)
+            self.create_subscription(UInt8, "/numbers", lambda _: busy(9), 1)
+            self.create_timer(1.0, lambda: publisher.publish(UInt8()))
+
+    stop = rsltrace.StopSpec(duration="1500ms")
+    job = rsltrace.Job(nodes=[rsltrace.NodeSpec(node=Busy)], stop=stop)
+    rsltrace.record(job, tmp_path / "a.mcap")
+    assert "/busy: subscription /numbers" in capsys.readouterr().err
 
 
 LIBRARY = """

@@ -221,10 +221,7 @@ class EventLoop(LoopFields):
         self.looks_at = -1
         while True:
             # Time steps with one arrival and nothing else due.
-            while (next_one := self.next_arrival()) is not False:
-                now_ns = self.now_ns
-                if next_one is not None:
-                    next_one.dispatch()
+            now_ns = self.run_arrivals(now_ns)
             if self.stepped_ns == self.now_ns:
                 now_ns, self.stepped_ns = self.stepped_ns, -1
             while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
@@ -237,10 +234,8 @@ class EventLoop(LoopFields):
                 self.looks_at = limit  # first: a signal that comes after this takes it back
                 if self._interrupt:
                     break
-                if tasks:
-                    tasks.popleft().dispatch()
-                elif ready:
-                    ready.popleft().dispatch()
+                if tasks or ready:
+                    self.run_ready(limit)
                 else:
                     now_ns = self.now_ns  # a callback may have blocked, and time have passed
                     if timers.next_ns <= now_ns:
@@ -293,8 +288,27 @@ class EventLoop(LoopFields):
             return None
         return ready.popleft() if receiver is None and ready else receiver
 
+    def python_run_arrivals(self, now_ns: int) -> int:
+        """Dispatch time steps with one arrival; return when the last one was, else ``now_ns``."""
+        while (next_one := self.next_arrival()) is not False:
+            now_ns = self.now_ns
+            if next_one is not None:
+                next_one.dispatch()
+        return now_ns
+
+    def python_run_ready(self, limit: int) -> None:
+        """Dispatch tasks, and what is ready, until none is left or ``limit`` events have run."""
+        tasks, ready = self.tasks, self.ready
+        while (tasks or ready) and self.events < limit:
+            self.looks_at = limit  # first: a signal that comes after this takes it back
+            if self._interrupt:
+                return
+            (tasks or ready).popleft().dispatch()
+
     if core is None or TYPE_CHECKING:
         next_arrival = python_next_arrival
+        run_arrivals = python_run_arrivals
+        run_ready = python_run_ready
 
     def _run_idle(self) -> bool:
         """Let those poll who wait for idle time; return whether one has work now."""
