@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.diff import diff_files
+from rsltrace.diff.result import Diff
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 
@@ -147,3 +148,70 @@ def test_of_two_similar_entries_it_is_that_of_the_node(
         "/one/counter": ["nodes.0.parameters.unused"],
         "/two/counter": ["nodes.1.parameters.gain"],
     }
+
+
+_FACTORY = """
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import Float64
+class Item(Node):
+    def __init__(self, number):
+        super().__init__(f"item{number}")
+        self.gain = self.declare_parameter("gain", 1.0 + CHANGE * (number == 2)).value
+        self.out = self.create_publisher(Float64, f"count{number}", 10)
+        self.create_timer(0.1, lambda: self.out.publish(Float64(data=self.gain)))
+def main():
+    rclpy.init()
+    executor = rclpy.executors.SingleThreadedExecutor()
+    for item in [Item(number) for number in range(4)]:
+        executor.add_node(item)
+    executor.spin()
+"""
+
+
+def record_both(command: Callable[..., Any], code: str, values: tuple[str, str]) -> Diff:
+    """Return the diff of runs of a main ``m:main`` with two values of a constant."""
+    Path("job.yaml").write_text("nodes: [{main: 'm:main'}]\nstop: {duration: 500ms}\n")
+    for name, value in zip("ab", values, strict=True):
+        Path("m.py").write_text(f"CHANGE = {value}\n{code}")
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    return diff_files("a.mcap", "b.mcap")
+
+
+def test_a_parameter_of_one_of_many_nodes_that_a_main_makes_is_of_that_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Callable[..., Any]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = record_both(command, _FACTORY, ("0.0", "10.0"))
+    assert found.sentence.startswith("parameter gain of /item2 1.0 → 11.0 (code of module m); ")
+    assert "first effect: /item2 published a different data on /count2" in found.sentence
+    assert len(found.divergences) == 1
+
+
+_DEADLINE = """
+import rclpy
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64
+def main():
+    rclpy.init()
+    node = rclpy.create_node("source")
+    events = PublisherEventCallbacks(deadline=lambda status: None)
+    qos = QoSProfile(depth=1, deadline=Duration(nanoseconds=CHANGE * 1_000_000))
+    out = node.create_publisher(Float64, "speed", qos, event_callbacks=events)
+    for _ in range(3):
+        out.publish(Float64())
+        rclpy.spin_once(node, timeout_sec=0.2)
+"""
+
+
+def test_a_main_that_another_deadline_wakes_names_the_deadline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Callable[..., Any]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = record_both(command, _DEADLINE, ("100", "150"))
+    assert found.sentence == (
+        "the resumed main m:main ran at 0.1 s in a and at 0.15 s in b, 50 ms later; likely cause: "
+        "/source created publisher /speed with a different QoS: deadline 100 → 150 ms"
+    )
