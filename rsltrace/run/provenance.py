@@ -21,6 +21,7 @@ from rsltrace.adapters.processes.build import is_python
 from rsltrace.guard.callers import is_rsltrace_module, is_user_file
 from rsltrace.guard.pin import HASH_SEED, import_threadpoolctl
 from rsltrace.job import Job
+from rsltrace.job.reading.substitute import installed_prefixes
 from rsltrace.job.values.target import Target
 from rsltrace.run.plans.executables import executable_file
 from rsltrace.run.process import COPIED_FILES, is_below, is_pytest_module, run_as_main, user_modules
@@ -192,7 +193,8 @@ def source_files(job: Job) -> dict[str, Path]:
 
 
 def loaded_modules(job: Job) -> dict[str, Path]:
-    """Return the files of all modules loaded from the job's search path, by name.
+    """Return the files of all modules loaded from the job's search path, by name; also those of its
+    entries' packages where they are installed, in a sourced workspace or with pip.
 
     Test modules are left out unless a node is in one.
     """
@@ -201,8 +203,25 @@ def loaded_modules(job: Job) -> dict[str, Path]:
     copied = {name: Path(file) for name, file in COPIED_FILES.items() if is_below(file, folders)}
     return {
         name: path
-        for name, path in {**copied, **user_modules(folders)}.items()
+        for name, path in {**copied, **_of_workspace(job), **user_modules(folders)}.items()
         if name in of_nodes or not is_pytest_module(name)
+    }
+
+
+def _of_workspace(job: Job) -> dict[str, Path]:
+    """Return the files of the loaded modules of entries' packages that are installed."""
+    packages = {spec.package for spec in job.nodes} - {"", *_PACKAGES}
+    prefixes = tuple(map(str, installed_prefixes())) if packages else ()
+    files = {
+        name: getattr(module, "__file__", None)
+        for name, module in sys.modules.items()
+        if name.partition(".")[0] in packages
+    }
+    files.update((name, f) for name, f in COPIED_FILES.items() if name.split(".")[0] in packages)
+    return {
+        name: Path(file)
+        for name, file in sorted(files.items())
+        if isinstance(file, str) and any(map(Path(file).is_relative_to, prefixes))
     }
 
 

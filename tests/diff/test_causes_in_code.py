@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -215,3 +216,32 @@ def test_a_main_that_another_deadline_wakes_names_the_deadline(
         "the resumed main m:main ran at 0.1 s in a and at 0.15 s in b, 50 ms later; likely cause: "
         "/source created publisher /speed with a different QoS: deadline 100 → 150 ms"
     )
+
+
+def test_of_a_package_that_a_workspace_has_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Callable[..., Any]
+) -> None:
+    """As ``colcon build`` without ``--symlink-install`` leaves it."""
+    site = tmp_path / "install/lib/python3/site-packages"
+    files = {
+        "install/share/ament_index/resource_index/packages/factory_bot": "",
+        "install/lib/python3/site-packages/factory_bot/__init__.py": "",
+        "install/lib/python3/site-packages/factory_bot-1.dist-info/METADATA": "Name: factory_bot\n",
+        "install/lib/python3/site-packages/factory_bot-1.dist-info/entry_points.txt": (
+            "[console_scripts]\nfactory = factory_bot.nodes:main\n"
+        ),
+        "jobs/job.yaml": "nodes: [{executable: factory_bot/factory}]\nstop: {duration: 500ms}\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "install"))
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.chdir(tmp_path / "jobs")
+    for name, change in (("a", "0.0"), ("b", "10.0")):
+        (site / "factory_bot/nodes.py").write_text(f"CHANGE = {change}\n{_FACTORY}")
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+        for module in ("factory_bot.nodes", "factory_bot"):
+            sys.modules.pop(module, None)
+    assert cause("a.mcap", "b.mcap") == ["code of module factory_bot.nodes"]
+    assert "factory_bot.nodes" in command("replay", "a.mcap").stderr
