@@ -23,7 +23,13 @@ from rsltrace.native.priorities import order, real_time_class
 from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
 from rsltrace.run.process import RunCallbacks
-from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
+from rsltrace.run.provenance import (
+    SourceHashes,
+    environment,
+    payload_filter,
+    source_files,
+    write_job,
+)
 from rsltrace.run.stop_rules import (
     StopInputs,
     conditions_of,
@@ -175,7 +181,7 @@ class NativeRun:
         writer = TraceWriter(path, force=force, events_per_segment=job.record.segment_events)
         write_job(writer, job)
         writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
-        write_sources(writer, job, sources)
+        SourceHashes(writer, source_files(job) if sources is None else sources)
         writer.add_metadata(
             METADATA_NATIVE,
             {

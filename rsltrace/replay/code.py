@@ -11,11 +11,12 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.workspace.installs import module_folders
+from rsltrace.adapters.workspace.installs import installed_files, module_folders
 from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.job.values.target import target_text
-from rsltrace.run.plans.executables import executable_source
+from rsltrace.run.plans.executables import executable_file, executable_source
+from rsltrace.source_packages import source_packages
 from rsltrace.trace.model.module_search import find_module
 
 _OF_FILES = "file:"
@@ -92,17 +93,25 @@ def _named_by(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path | No
 
 
 def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path | None]]:
+    file = executable_file(name) or _unbuilt_script(name, folders)
+    if file is not None:
+        yield f"{_OF_FILES}{name}", file
+        return
     try:
         found = executable_source(name, where="")
     except JobError:
         if not any(Path(folder, "package.xml").is_file() for folder in folders):
             yield name, None  # else it is one of an unbuilt package
         return
-    if isinstance(found, Path):
-        yield name, found
-    else:
-        module = found.partition(":")[0]
-        yield module, module_file(module, folders)
+    module = str(found).partition(":")[0]
+    yield module, module_file(module, folders)
+
+
+def _unbuilt_script(target: str, folders: Sequence[str]) -> Path | None:
+    """Return the script that ``CMakeLists.txt`` of an unbuilt package installs as an executable."""
+    package = source_packages(map(Path, folders)).get(target.partition("/")[0])
+    installed = {} if package is None else dict(installed_files(package, ask=False))
+    return installed.get(f"lib/{target}")
 
 
 def module_file(module: str, folders: Sequence[str], *, installed: bool = True) -> Path | None:

@@ -17,6 +17,7 @@ from rsltrace.job import Job, StopSpec, job_from_text, load_job
 from rsltrace.job.fields import COMMAND_LINE
 from rsltrace.job.parts.scheduling import PolicySpec
 from rsltrace.job.reading.resolved import job_from_resolved
+from rsltrace.job.reading.substitute import installed_prefixes
 from rsltrace.replay.code import JobCodeFile, job_code_files, module_file
 from rsltrace.replay.edits import Edit, parse_edit
 from rsltrace.run.inputs import expand_launch_files
@@ -143,7 +144,15 @@ def _folder_markers(trace: Trace) -> list[str]:
     """Return the files that identify the job's folder: its file, or its nodes' modules."""
     if job_name(trace):
         return [job_name(trace)]
-    return [name for name in trace.metadata(METADATA_SOURCES) if not name.startswith("file:")]
+    names = [name for name in trace.metadata(METADATA_SOURCES) if not name.startswith("file:")]
+    return [name for name in names if not _is_of_workspace(name)]
+
+
+def _is_of_workspace(module: str) -> bool:
+    """Whether a module is installed in a sourced workspace, wherever the job's folder is."""
+    prefixes = installed_prefixes()
+    file = module_file(module, []) if prefixes else None
+    return file is not None and any(map(file.is_relative_to, prefixes))
 
 
 def _match_folder(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bool, bool]:

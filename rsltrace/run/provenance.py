@@ -11,7 +11,7 @@ import platform
 import sys
 import warnings
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import lru_cache
@@ -20,10 +20,13 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from rsltrace._version import __version__
+from rsltrace.adapters.processes.build import is_python
 from rsltrace.guard.callers import is_rsltrace_module, is_user_file
 from rsltrace.guard.pin import HASH_SEED, import_threadpoolctl
 from rsltrace.job import Job
+from rsltrace.job.reading.substitute import installed_prefixes
 from rsltrace.job.values.target import Target
+from rsltrace.run.plans.executables import executable_file
 from rsltrace.run.process import COPIED_FILES, is_below, is_pytest_module, run_as_main, user_modules
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
@@ -137,14 +140,14 @@ def _module_of_value(value: object) -> str:
     return name if isinstance(name, str) else ""
 
 
-def module_code(modules: Mapping[str, Path]) -> dict[str, str]:
-    """Return, as JSON for each Python module, the ``hash`` of its syntax tree and its ``imports``
-    of the other modules."""
+def module_code(modules: Mapping[str, Path], late: Container[str] = ()) -> dict[str, str]:
+    """Return, as JSON for each Python module, the ``hash`` of its syntax tree, its ``imports`` of
+    the other modules, and if it is ``late``."""
     found = {}
     for name, path in modules.items():
-        if path.suffix != ".py":
-            continue
         try:
+            if not is_python(path):
+                continue
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Python has said it when it compiled them
                 tree = ast.parse(path.read_bytes())
@@ -153,7 +156,8 @@ def module_code(modules: Mapping[str, Path]) -> dict[str, str]:
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         imports = sorted({*_imported(tree, package)} & {*modules} - {name})
         digest = hashlib.sha256(ast.dump(tree).encode("utf-8", "surrogatepass")).hexdigest()[:16]
-        found[name] = json.dumps({"hash": digest, "imports": imports})
+        code: dict[str, object] = {"hash": digest, "imports": imports}
+        found[name] = json.dumps(code | ({"late": True} if name in late else {}))
     return found
 
 
@@ -201,42 +205,89 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 
 def source_files(job: Job) -> dict[str, Path]:
-    """Return the files of all modules loaded from the job's search path, by name; also its scripts,
-    programs and model files (``file:`` and the path in the job).
+    """Return the files of ``loaded_modules``, and the job's scripts, programs, executables and
+    model files (``file:`` and what the job calls them)."""
+    modules = loaded_modules(job)
+    modules.update(_run_as_main(job))
+    modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
+    return modules
+
+
+def loaded_modules(job: Job) -> dict[str, Path]:
+    """Return the files of all modules loaded from the job's search path, by name; also those of its
+    entries' packages where they are installed, in a sourced workspace or with pip.
 
     Test modules are left out unless a node is in one.
     """
     folders = [str(job.resolve(folder)) for folder in job.search_path]
     of_nodes = {_module_of(target) for spec in job.nodes for target in (spec.node, spec.main)}
     copied = {name: Path(file) for name, file in COPIED_FILES.items() if is_below(file, folders)}
-    modules = {
+    return {
         name: path
-        for name, path in {**copied, **user_modules(folders)}.items()
+        for name, path in {**copied, **_of_workspace(job), **user_modules(folders)}.items()
         if name in of_nodes or not is_pytest_module(name)
     }
-    modules.update(_run_as_main(job, folders))
-    modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
-    return modules
 
 
-def write_sources(writer: TraceWriter, job: Job, files: Mapping[str, Path] | None = None) -> None:
-    """Write hashes of the code files and of their syntax trees into the trace.
+def _of_workspace(job: Job) -> dict[str, Path]:
+    """Return the files of the loaded modules of entries' packages that are installed."""
+    packages = {spec.package for spec in job.nodes} - {"", *_PACKAGES}
+    prefixes = tuple(map(str, installed_prefixes())) if packages else ()
+    files = {
+        name: getattr(module, "__file__", None)
+        for name, module in sys.modules.items()
+        if name.partition(".")[0] in packages
+    }
+    files.update((name, f) for name, f in COPIED_FILES.items() if name.split(".")[0] in packages)
+    return {
+        name: Path(file)
+        for name, file in sorted(files.items())
+        if isinstance(file, str) and any(map(Path(file).is_relative_to, prefixes))
+    }
 
-    ``files`` are those that other processes have loaded; None: those of this one.
-    """
-    if files is None:
-        files = source_files(job)
-    hashes = {n: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for n, path in files.items()}
-    writer.add_metadata(METADATA_SOURCES, hashes)
-    if code := module_code(files):
-        writer.add_metadata(METADATA_CODE, code)
+
+class SourceHashes:
+    """Writes hashes of code files and of their syntax trees into a trace, anew when a run has
+    loaded more: a reader takes the last."""
+
+    def __init__(self, writer: TraceWriter, files: Mapping[str, Path]) -> None:
+        self._writer = writer
+        self._files = dict(files)
+        self._hashes = {name: _file_hash(path) for name, path in files.items()}
+        self._late: set[str] = set()
+        self._write()
+
+    def add(self, files: Mapping[str, Path], *, late: bool = False) -> None:
+        """Add the files that are new. ``late``: callbacks have loaded them, which they may do in
+        one run and not in another of the same code."""
+        for name in files.keys() - self._files.keys():
+            with suppress(OSError):  # it has been removed since
+                self._hashes[name] = _file_hash(files[name])
+                self._files[name] = files[name]
+                self._late |= {name} if late else set()
+        if self._hashes.keys() != self._written:
+            self._write()
+
+    def _write(self) -> None:
+        self._written = set(self._hashes)
+        self._writer.add_metadata(METADATA_SOURCES, self._hashes)
+        if code := module_code(self._files, self._late):
+            self._writer.add_metadata(METADATA_CODE, code)
 
 
-def _run_as_main(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path]]:
+def _file_hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def _run_as_main(job: Job) -> Iterator[tuple[str, Path]]:
     """Yield the files that run as ``__main__`` and are not loaded modules."""
+    folders = [str(job.resolve(folder)) for folder in job.search_path]
     for spec in job.nodes:
         file = spec.script or spec.program
-        if file is not None:
+        if spec.executable is not None:
+            if (found_file := executable_file(spec.executable)) is not None:
+                yield f"file:{spec.executable}", found_file
+        elif file is not None:
             yield f"file:{file}", job.resolve(file)
         elif spec.module is not None:
             found = run_as_main(spec.module)

@@ -57,10 +57,12 @@ from rsltrace.run.process import (
 )
 from rsltrace.run.provenance import (
     LateLibraryScan,
+    SourceHashes,
     environment,
+    loaded_modules,
     payload_filter,
+    source_files,
     write_job,
-    write_sources,
 )
 from rsltrace.run.stop_rules import (
     StopInputs,
@@ -200,6 +202,7 @@ class RunSession:
         self._plan: NetworkPlan | None
         self._recorded: RecordedOrderObserver | NativeOrderObserver | None
         self._late: LateLibraryScan
+        self._sources: SourceHashes | None = None
         self._processes: ProcessAdapter
         self._numerics_known = True
         self._samples: StateSamples | None = None
@@ -375,7 +378,7 @@ class RunSession:
         described = environment(job)
         self._numerics_known = "numerics" in described
         writer.add_metadata(METADATA_ENVIRONMENT, described)
-        write_sources(writer, job)
+        self._sources = SourceHashes(writer, source_files(job))
         for name, values in self._metadata.items():
             writer.add_metadata(name, values)
         self._guarded.trace_begins(recorder, self.loop.now_ns)
@@ -438,6 +441,11 @@ class RunSession:
                 self.world.jump(self.start_ns)
                 self.has_begun = not self.ended
                 self.world.starts.begin(self.start_ns)
+        self._add_sources()
+
+    def _add_sources(self, *, late: bool = False) -> None:
+        if self._sources is not None:
+            self._sources.add(loaded_modules(self.job), late=late)
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. Failures are in ``error``."""
@@ -533,6 +541,7 @@ class RunSession:
             if self._samples is not None:
                 self._samples.take_last()
             self.world.destroy()
+        self._add_sources(late=True)
         error = self.world.error
         exit_code = stop.exit_code or self.world.exit_code or self._processes.exit_code
         if error:

@@ -217,3 +217,18 @@ def test_whatever_differs_is_told_and_nothing_else(a: Any, b: Any) -> None:
     assert bool(found) is not same
     assert all(setting.a != setting.b for setting in found)
     assert job_settings(sides[0], sides[0]) == ()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_an_entry_that_is_added_is_not_taken_for_the_one_that_is_like_it(
+    tmp_path: Path, at: int
+) -> None:
+    entry = "  - {{main: 'm:main', namespace: {}, parameters: {{gain: {}}}}}\n"
+    a = recorded(tmp_path, "nodes:\n" + entry.format("/own", 1.0))
+    entries = [entry.format("/own", 2.0)]
+    entries.insert(at, entry.format("/new", 1.0))
+    b = recorded(tmp_path, "nodes:\n" + "".join(entries))
+    assert told(a, b).keys() == {
+        "robot.yaml:2: nodes.0.parameters.gain",
+        f"robot.yaml:{2 + at}: nodes.{at}",
+    }

@@ -31,9 +31,12 @@ _PROGRAMS = ("add_executable", "ament_auto_add_executable")
 _NO_MODULES = frozenset("test tests launch setup conftest scripts doc docs config resource".split())
 
 
-def installed_files(package: SourcePackage) -> Iterator[tuple[str, Path]]:
-    """Give where each file or folder would be installed below the prefix, and where it is now."""
-    setup = setup_py(package.folder)
+def installed_files(package: SourcePackage, *, ask: bool = True) -> Iterator[tuple[str, Path]]:
+    """Give where each file or folder would be installed below the prefix, and where it is now.
+
+    Unless ``ask``, no ``setup.py`` is run to find out.
+    """
+    setup = setup_py(package.folder) if ask else {}
     for folder, files in setup.get("data_files", ()):
         for file in files:
             yield f"{folder}/{os.path.basename(file)}", package.folder / file

@@ -108,14 +108,12 @@ class DivergenceCase:
 
     def blame(self, *, inside: bool = False, drawn: bool = False) -> bool:
         """Find which settings differ that can be the cause; False if there are none."""
-        views = (self.a, self.b, self.other_a, self.other_b, self.cause_a, self.cause_b)
+        views = [self.a, self.b]
+        if not inside:
+            views += [self.other_a, self.other_b, self.cause_a, self.cause_b]
         involved = [view for view in views if view is not None]
         nodes = {view.node for view in involved}
-        mains = {
-            v.entity.name.partition(":")[0]
-            for v in involved
-            if v.entity.kind == EntityKind.MAIN.label
-        }
+        mains = {v.entity.name for v in involved if v.entity.kind == EntityKind.MAIN.label}
         if any(map(_is_qos_event, self.messages)):
             nodes = set()  # which has made them is not known, but whose QoS has changed
         if self.changed is not None:

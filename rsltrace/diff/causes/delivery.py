@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rsltrace.diff.alignment.rows import BAG, ComparedTrace, load_rows
+from rsltrace.diff.alignment.rows import BAG, ComparedTrace, load_rows, outputs_of
 from rsltrace.diff.causes.event_views import entity_detail
 from rsltrace.diff.facts.causes import (
     Loss,
@@ -31,6 +31,7 @@ from rsltrace.trace.words.entities import EntityKey
 
 _LOOKED_AT_MAX = 1000
 _PUBLISHER = EntityKind.PUBLISHER.label
+_ENTITY = int(OutputKind.ENTITY)
 _ENDS = {_PUBLISHER, EntityKind.SUBSCRIPTION.label}
 _QOS_EVENT = EntityKind.QOS_EVENT.label
 _OF_QOS = (EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT, EventKind.QOS_EVENT)
@@ -114,10 +115,18 @@ def _qos(detail: dict[str, object]) -> dict[str, object]:
 # -- entities with other properties ---------------------------------------------------------------
 
 
-def topics_of(view: EventSummary, messages: Sequence[MessageDifference]) -> frozenset[str]:
-    """Return the topics and services whose QoS an event, or what differs in it, can depend on."""
+def topics_of(
+    view: EventSummary,
+    messages: Sequence[MessageDifference],
+    run: ComparedTrace | None = None,
+) -> frozenset[str]:
+    """Return the topics and services whose QoS an event, or what differs in it, can depend on; of
+    an event of a ``run``, also when it happened: a missed deadline wakes a main."""
     met = [view.entity] if view.kind in _OF_QOS else []
     met += [m.entity for m in messages if m.kind in (OutputKind.ENTITY, OutputKind.DRAW)]
+    if run is not None:
+        made = (run.matching.keys[n] for k, n, *_ in outputs_of(run, view.index) if k == _ENTITY)
+        met += [key for key in made if key.kind == _QOS_EVENT]
     # A QoS event goes by its topic and its status: "/scan incompatible".
     return frozenset(
         key.name.rpartition(" ")[0] if key.kind == _QOS_EVENT else key.name for key in met

@@ -27,6 +27,10 @@ from rsltrace.trace.reader import Trace
 _LINES_MAX = 20_000
 """Longer job files are compared as a whole: difflib takes time with the square of the lines."""
 
+_KEY_WEIGHT = 1000
+_ENTRIES_MAX = 100
+"""Longer lists are compared entry by entry, in order."""
+
 _BYTES_MAX = 1 << 20
 _NANOSECONDS = "_ns"
 _PATHS = frozenset(("parameter_files", "path", "file", "script", "program"))
@@ -258,13 +262,51 @@ def _changed_entries(
         matcher = difflib.SequenceMatcher(None, text_a, text_b, autojunk=False)
         changes = [code[1:] for code in matcher.get_opcodes() if code[0] != "equal"]
     for begin_a, end_a, begin_b, end_b in changes:
-        alike = min(end_a - begin_a, end_b - begin_b)
-        for at_a, at_b in zip(range(begin_a, end_a), range(begin_b, end_b), strict=False):
+        pairs = _most_alike(a[begin_a:end_a], b[begin_b:end_b])
+        for at_a, at_b in pairs:
+            at_a, at_b = begin_a + at_a, begin_b + at_b
             yield from _changes((*path_a, at_a), (*path_b, at_b), a[at_a], b[at_b])
-        for at_a in range(begin_a + alike, end_a):
+        for at_a in sorted({*range(begin_a, end_a)} - {begin_a + at for at, _ in pairs}):
             yield _Change((*path_a, at_a), (*path_b, at_a), (a[at_a],), None)
-        for at_b in range(begin_b + alike, end_b):
+        for at_b in sorted({*range(begin_b, end_b)} - {begin_b + at for _, at in pairs}):
             yield _Change((*path_a, at_b), (*path_b, at_b), None, (b[at_b],))
+
+
+def _most_alike(a: list[Any], b: list[Any]) -> list[tuple[int, int]]:
+    """Pair the entries of the shorter list with those of the longer one, in order: so that as much
+    as possible of the pairs is the same, and the rest has been added or removed."""
+    if len(a) > len(b):
+        return [(at_a, at_b) for at_b, at_a in _most_alike(b, a)]
+    if len(a) == len(b) or len(b) > _ENTRIES_MAX:
+        return [(at, at) for at in range(len(a))]
+    spare = len(b) - len(a)
+    best: list[list[tuple[int, int]]] = [[(0, 0)] * (spare + 1)]
+    """By entries of a paired and entries of b left out: what is alike, and the last gap."""
+    for at, entry in enumerate(a):
+        row: list[tuple[int, int]] = []
+        for left_out in range(spare + 1):
+            alike, gap = best[-1][left_out][0] + _alike(entry, b[at + left_out]), left_out
+            if row and row[-1][0] >= alike:
+                alike, gap = row[-1]
+            row.append((alike, gap))
+        best.append(row)
+    pairs, gap = [], spare
+    for at in range(len(a) - 1, -1, -1):
+        gap = best[at + 1][gap][1]
+        pairs.append((at, at + gap))
+    return pairs[::-1]
+
+
+def _alike(a: dict[str, Any], b: dict[str, Any]) -> int:
+    """Return how much is the same in two entries: names and the like count more than
+    what is within a key."""
+    alike = 0
+    for x, y in ((a[key], b[key]) for key in a.keys() & b.keys()):
+        if isinstance(x, dict) and isinstance(y, dict):
+            alike += sum(x[key] == y[key] for key in x.keys() & y.keys())
+        elif x == y:
+            alike += _KEY_WEIGHT
+    return alike
 
 
 def _text(value: Any, digits: int, key: str | int) -> str | None:

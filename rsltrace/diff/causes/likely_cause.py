@@ -117,7 +117,8 @@ def changed_properties(
     what = judgement.what  # a history of another depth: other messages are kept for later
     lost = isinstance(what, EventInOneRun) and what.loss is None
     with_depth = lost or what is DivergenceKind.OTHER_SENDER
-    topics = topics_of(view, judgement.messages)
+    run = runs[0] if judgement.a is not None else runs[1]
+    topics = topics_of(view, judgement.messages, run)
     return entity_changes(*runs, topics, nodes - {""}, with_depth=with_depth)
 
 

@@ -425,6 +425,8 @@ class Propagation:
             elif kind in REACHING:
                 _reach(reached, number, stamp, 0)
                 self._sent.setdefault(keys[number].name, origin)
+                if rows.kind[place] == CONSTRUCT:  # of one of several nodes that a main makes
+                    self._taint(nodes[number], origin)
         if changes_owner:
             self._taint(owner, origin)
         if takes_longer:

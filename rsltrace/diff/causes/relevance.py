@@ -15,6 +15,7 @@ from typing import Any
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
 from rsltrace.diff.alignment.rows import ComparedTrace
+from rsltrace.diff.causes.job_entries import JobEntries, job_entries
 from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import METADATA_CODE, METADATA_EDITS, METADATA_SOURCES
@@ -50,7 +51,7 @@ def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
         for name in sorted({*of_a, *of_b}, key=lambda name: (name not in _FIRST, name)):
             if name == "math" and not (name in of_a and name in of_b):
                 continue  # older traces do not tell it
-            if of_a.get(name) != of_b.get(name) and not (is_code and same_code(a, b, name)):
+            if of_a.get(name) != of_b.get(name) and not (is_code and _same_code(a, b, name)):
                 file = name.removeprefix("file:")
                 kind_of_it = kind if file == name else SettingKind.FILE
                 value_a, value_b = (_with_release(name, of.get(name)) for of in (of_a, of_b))
@@ -85,10 +86,13 @@ def entity_settings(matching: EntityMatching) -> tuple[Setting, ...]:
 # -- code ----------------------------------------------------------------------------------------
 
 
-def same_code(a: Trace, b: Trace, name: str) -> bool:
-    """Whether a module means the same in both, as far as the traces tell."""
-    one, other = (_code(trace, name).get("hash") for trace in (a, b))
-    return one is not None and one == other
+def _same_code(a: Trace, b: Trace, name: str) -> bool:
+    """Whether a module means the same in both, as far as the traces tell. One that callbacks loaded
+    in one run only is not a difference of the code."""
+    one, other = _code(a, name), _code(b, name)
+    if one and other:
+        return one.get("hash") is not None and one.get("hash") == other.get("hash")
+    return bool((one or other).get("late"))
 
 
 def used_by(traces: tuple[Trace, Trace], module: str) -> set[str]:
@@ -140,7 +144,7 @@ class DivergenceSite:
     inside: bool = False
     drawn: bool = False
     mains: frozenset[str] = frozenset()
-    """The modules of the mains involved, which belong to no node."""
+    """The names of the mains involved, which belong to no node."""
 
 
 @dataclass
@@ -158,6 +162,8 @@ class Relevance:
     def _can_matter(self, setting: Setting, place: DivergenceSite) -> bool:
         if setting.kind is SettingKind.CODE:
             return self._is_code_of(setting.name, place)
+        if setting.kind is SettingKind.FILE:
+            return self._is_code_of(f"file:{setting.name}", place)
         key, *rest = setting.key.split(".") if setting.key else [""]
         if key in _NEVER or (key in _WHEN and place.inside):
             return False
@@ -168,16 +174,20 @@ class Relevance:
         if key == "nodes" and len(rest) > 1:
             if rest[1] in _CONSTRUCTING and not place.constructing:
                 return False
-            owners = self._nodes_of(rest[0])
+            owners = self._nodes_of(rest[0], of_b=setting.a is None)
             return not owners or bool(owners & place.nodes)
         return True
 
-    def _is_code_of(self, module: str, place: DivergenceSite) -> bool:
-        """Whether a module is one that the nodes may use: not that of other nodes alone."""
-        if any(module in self._used_by(main) for main in place.mains):
-            return True
-        owners = {name for name, of in self._modules.items() if module in self._used_by(of)}
-        return not owners or not place.nodes or bool(owners & place.nodes)
+    def _is_code_of(self, name: str, place: DivergenceSite) -> bool:
+        """Whether a module or file is one that the nodes may use: not that of other nodes alone."""
+        owners = {
+            owner
+            for entries in self._entries
+            for owner, roots in entries.roots.items()
+            if any(name in self._used_by(root) for root in roots)
+        }
+        involved = place.nodes | place.mains
+        return not owners or not place.nodes or not owners.isdisjoint(involved)
 
     def _used_by(self, module: str) -> set[str]:
         if module not in self._used:
@@ -218,14 +228,17 @@ class Relevance:
     def _has_topic(self, glob: str) -> bool:
         return any(fnmatchcase(name, glob) for name in self._names)
 
-    def _nodes_of(self, entry: str) -> set[str]:
-        """Return the full names of the nodes of an entry of ``nodes:`` (its number or name)."""
+    def _nodes_of(self, entry: str, *, of_b: bool) -> set[str]:
+        """Return the full names of the nodes of an entry of ``nodes:`` (its name, or its number in
+        the job of a, or ``of_b``)."""
         found: set[str] = set()
-        for job in self._jobs:
+        for side, (job, made) in enumerate(zip(self._jobs, self._entries, strict=True)):
             for number, node in enumerate(job.get("nodes") or []):
-                if isinstance(node, dict) and entry in (str(number), node.get("name")):
-                    target = node.get("node") or ""
-                    found |= {name for name, of in self._classes if of == target}
+                names = {node.get("name"), str(number) if side == of_b else None} - {None}
+                if entry in names:
+                    found |= made.nodes.get(number) or {
+                        name for name, of in self._classes if of == (node.get("node") or "")
+                    }
         return found
 
     def is_of_a_class(self, node: str) -> bool:
@@ -277,6 +290,11 @@ class Relevance:
     @cached_property
     def _jobs(self) -> tuple[dict[str, Any], dict[str, Any]]:
         return resolved_job(self._traces[0]), resolved_job(self._traces[1])
+
+    @cached_property
+    def _entries(self) -> tuple[JobEntries, JobEntries]:
+        (a, b), (job_a, job_b) = self._traces, self._jobs
+        return job_entries(a, job_a), job_entries(b, job_b)
 
     @cached_property
     def _names(self) -> frozenset[str]:

@@ -123,9 +123,9 @@ def _lead(settings: Sequence[Setting], constructor: Judgement | None) -> str:
 
 def _parameters(constructor: Judgement) -> list[str]:
     """Return the parameters that a constructor set to another value, with the values."""
-    assert constructor.one is not None
-    node, found = constructor.one.node, []
+    found = []
     for message in constructor.messages:
+        node = message.entity.node  # a main may construct several
         if isinstance(message.fate, ParameterChanges):
             changed = message.fate.values
             found += [f"parameter {name} of {node} {pair_text(a, b)}" for name, a, b in changed]

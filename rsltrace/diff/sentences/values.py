@@ -165,11 +165,13 @@ def _setting_text(setting: Setting) -> str:
     if setting.kind is SettingKind.ENVIRONMENT and setting.a is not None and setting.b is not None:
         shown = contrasting_texts(setting.a, setting.b, _SETTING_MAX)
         return f"environment.{printable(setting.name)} ({', '.join(shown)})"
-    if not setting.key or any(len(value) > _SETTING_MAX or "\n" in value for value in values):
+    if not setting.key:
         return name
+    is_long = any(len(value) > _SETTING_MAX or "\n" in value for value in values)
     if len(values) == 2:
-        return f"{name} {' → '.join(values)}"
-    return f"{name} ({values[0]} only in {'b' if setting.a is None else 'a'})" if values else ""
+        return name if is_long else f"{name} {' → '.join(values)}"
+    only = f"only in {'b' if setting.a is None else 'a'}"
+    return f"{name} ({only if is_long else f'{values[0]} {only}'})" if values else ""
 
 
 # -- messages and other outputs --------------------------------------------------------------------

@@ -251,11 +251,21 @@ def executable_source(target: str, *, where: str) -> str | Path:
     :raises JobError: as ``find_executable``.
     """
     found = find_executable(target, where=where)
-    package, _, name = target.partition("/")
     if isinstance(found, str):
         return found
-    files: dict[str, str | Path] = {**unbuilt_executables(package), **_installed_files(package)}
-    return files[name]
+    file = executable_file(target)
+    assert file is not None, "find_executable has read it"
+    return file
+
+
+def executable_file(target: str) -> Path | None:
+    """Return the script or compiled program that is ``package/name``, None if it is a function."""
+    package, _, name = target.partition("/")
+    if name in _console_scripts(package):
+        return None
+    files = {**unbuilt_executables(package), **_installed_files(package)}
+    found = files.get(name)
+    return found if isinstance(found, Path) else None
 
 
 def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
@@ -302,8 +312,7 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
 
 def compiled_file(target: str) -> Path | None:
     """Return the file of ``package/name`` if it is a compiled program, else None."""
-    package, _, name = target.partition("/")
-    path = None if name in _console_scripts(package) else _installed_files(package).get(name)
+    path = executable_file(target)
     return path if path is not None and is_compiled(path) else None
 
 
