@@ -605,7 +605,7 @@ def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) ->
 
 @pytest.mark.long
 def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any) -> None:
-    from rclpy.action import ActionClient
+    from rclpy.action import ActionClient, get_action_names_and_types
     from rclpy.impl.implementation_singleton import rclpy_implementation
     from test_msgs.action import Fibonacci
 
@@ -638,6 +638,11 @@ def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any
             node.get_node_names,
             node.get_topic_names_and_types,
             lambda: node.count_publishers("numbers"),
+            lambda: node.get_publishers_info_by_topic("numbers"),
+            lambda: node.get_client_names_and_types_by_node(node.get_name(), "/"),
+            lambda: get_action_names_and_types(node),
+            node.publisher.assert_liveliness,
+            node.publisher.wait_for_all_acked,
             context.handle.shutdown,
         ):
             with pytest.raises(rclpy_implementation.RCLError) as error:
@@ -651,9 +656,23 @@ def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any
         lambda: listener(heard),
         duration=1.2,  # type: ignore[arg-type]
     )
-    assert refused[0] == "Failed to publish: publisher's context is invalid"
+    assert refused[:2] == [
+        "Failed to publish: publisher's context is invalid",
+        "failed to get subscription count: publisher's context is invalid",
+    ]
+    node_is_down = "rcl node's context is invalid"
+    assert refused[3] == f"Failed to create publisher: {node_is_down}"
+    assert refused[11:-1] == [
+        f"Failed to get node names: {node_is_down}",
+        f"failed to get topic names and types: {node_is_down}",
+        f"Error in rcl_count_publishers: {node_is_down}",
+        f"Failed to get information by topic for publishers: {node_is_down}",
+        f"failed to get client names and types: {node_is_down}",
+        f"Failed to get action names and type: {node_is_down}",
+        "Failed to assert liveliness on the Publisher: publisher's context is invalid",
+        "Failed to wait for all acknowledgements: publisher's context is invalid",
+    ]
     assert refused[-1].startswith("failed to shutdown: rcl_shutdown already called")
-    assert len(refused) == 15
     assert [number for number, _ in heard] == [1, 2]  # type: ignore[misc]
 
 

@@ -247,6 +247,8 @@ def test_log_levels_of_one_run_do_not_leak_into_the_next(simulate: Any) -> None:
 
 
 def test_graph_queries(simulate: Any) -> None:
+    from rclpy.node import NodeNameNonExistentError
+
     seen: dict[str, Any] = {}
 
     class Server(Node):
@@ -277,6 +279,13 @@ def test_graph_queries(simulate: Any) -> None:
             seen["hash"] = str(info.topic_type_hash)
             names = self.get_publisher_names_and_types_by_node("server", "/a")
             seen["by_node"] = dict(names)["/a/numbers"]
+
+            with pytest.raises(NodeNameNonExistentError, match="cannot get service names and ty"):
+                self.get_service_names_and_types_by_node("nobody", "/")
+            with pytest.raises(RuntimeError, match="failed to get service names and types: node n"):
+                self.get_service_names_and_types_by_node("no body", "/")
+            with pytest.raises(RuntimeError, match="failed to resolve name: topic name must not c"):
+                self.resolve_topic_name("not valid")
 
     simulate(Server, Curious, duration=1)
     assert seen == {

@@ -276,7 +276,7 @@ class ActionClientHandle(ActionHandle):
 
     def is_action_server_available(self) -> bool:
         """Return whether a server has all of its services and topics."""
-        graph = self.node.usable_graph
+        graph = self.node.usable_graph("Failed to check if action server is available")
         services = (self._goal, self._cancel, self._result)
         topics = (self._feedback, self._status)
         return all(graph.services(part.service) for part in services) and all(
