@@ -7,6 +7,7 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import SimEvent
 from rsltrace.adapters.rclpy.concurrency.callback_groups import is_busy
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
@@ -84,6 +85,15 @@ class TimerHandle(EntityHandle, Timer, TimerFields):
         dispatch = core.TimerFields.dispatch
         """Does the usual case, a free group and a plain function of a node that the loop runs, and
         leaves the others to ``dispatch_any``."""
+
+    def user_callback(self) -> object:
+        """Return its callback, or rclpy's class ``Rate`` for the timer of one."""
+        callback = super().user_callback()
+        if isinstance(getattr(callback, "__self__", None), SimEvent):
+            from rclpy.timer import Rate
+
+            return Rate
+        return callback
 
     def forget_callback(self) -> None:
         """Look up how to run the callback again."""
