@@ -274,6 +274,33 @@ def test_a_service_call_on_ones_own_single_threaded_executor_is_a_deadlock(simul
         simulate(main_spec(program))
 
 
+def test_domains_of_one_program_are_noted_as_they_meet(simulate: Any) -> None:
+    def program() -> None:
+        for domain in (0, 3):
+            context = rclpy.context.Context()
+            rclpy.init(context=context, domain_id=domain)
+            found = Node(f"in_{domain}", context=context).get_node_names()
+        assert found == ["in_0", "in_3"]
+
+    notes = simulate(main_spec(program)).result.notes
+    assert any("has nodes in domains [0, 3], which meet in a simulation" in note for note in notes)
+
+
+def test_arguments_that_rcl_refuses_raise_what_rclpy_raises(simulate: Any) -> None:
+    from rclpy.impl.implementation_singleton import rclpy_implementation as real
+
+    def program() -> None:
+        with pytest.raises(real.UnknownROSArgsError, match=r"^\['--bogus'\]$"):
+            rclpy.init(args=["--ros-args", "--bogus"])
+        for arguments in ("abc", [3]):
+            with pytest.raises(TypeError):
+                rclpy.init(args=arguments)  # type: ignore[arg-type]
+        with pytest.raises(real.RCLError, match="failed to initialize rcl: Couldn't parse remap"):
+            rclpy.init(args=["--ros-args", "-r", "::"], context=rclpy.context.Context())
+
+    simulate(main_spec(program))
+
+
 def test_a_rate_of_a_node_that_nobody_spins_is_a_deadlock_that_says_so(simulate: Any) -> None:
     """As natively: its timer is nobody's."""
 

@@ -54,7 +54,7 @@ from rsltrace.errors import UnsupportedError
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.middleware.graph import names_and_types
 from rsltrace.simulation.middleware.publisher import Publisher
-from rsltrace.simulation.middleware.qos.policies import Durability
+from rsltrace.simulation.middleware.qos.policies import Durability, History
 from rsltrace.simulation.middleware.qos.timing import (
     CountStatus,
     IncompatibleQosStatus,
@@ -245,11 +245,12 @@ class RclpyBoundary:
 
     def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
         check_process()
-        with self._argument_errors():
+        with self._argument_errors("failed to initialize rcl: ", self.RCLError):
             context = ContextHandle(self, self.runtime, arguments, domain_id)
         programs = self.runtime.programs
         if programs.main_context is None:
             programs.main_context = context
+        context.note_domains()
         return context
 
     def Node(  # noqa: N802
@@ -404,19 +405,18 @@ class RclpyBoundary:
     rclpy_get_validation_error_for_topic_name = staticmethod(topic_fault)
 
     def rclpy_remove_ros_args(self, arguments: list[str] | None) -> list[str]:
-        with self._argument_errors("Failed to parse ROS arguments: "):
+        with self._argument_errors("Failed to parse ROS arguments: ", self.RCLInvalidROSArgsError):
             return RosArguments(arguments or []).others
 
     @contextmanager
-    def _argument_errors(self, prefix: str = "") -> Iterator[None]:
+    def _argument_errors(self, prefix: str, kind: type[Exception]) -> Iterator[None]:
         """Raise rclpy's exceptions for arguments that rcl would refuse."""
         try:
             yield
         except UnknownArgumentsError as error:
-            text = str(error)
-            raise self.UnknownROSArgsError(text.partition(": ")[2] if prefix else text) from error
+            raise self.UnknownROSArgsError(str(error.unknown)) from error
         except InvalidArgumentsError as error:
-            raise self.RCLInvalidROSArgsError(f"{prefix}{error}") from error
+            raise kind(f"{prefix}{error}") from error
 
     # -- QoS ---------------------------------------------------------------------------------------
 
@@ -564,6 +564,7 @@ def _service_types(ends: Iterable[ServiceEndpoint]) -> list[tuple[str, list[str]
 
 
 def _endpoint_info(endpoint: Publisher | Subscription, endpoint_type: int) -> dict[str, Any]:
+    """Describe an endpoint as DDS discovers it, without the length of its queue."""
     from rclpy.topic_endpoint_info import TopicEndpointInfo
 
     _, text = endpoint.type.describe()
@@ -577,5 +578,5 @@ def _endpoint_info(endpoint: Publisher | Subscription, endpoint_type: int) -> di
         **({"topic_type_hash": type_hash} if has_hash else {}),
         "endpoint_type": endpoint_type,
         "endpoint_gid": list(endpoint.entity_id.to_bytes(16, "big")),
-        "qos_profile": profile_of(endpoint.qos),
+        "qos_profile": profile_of(endpoint.qos) | {"history": int(History.UNKNOWN), "depth": 0},
     }

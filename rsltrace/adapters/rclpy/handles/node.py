@@ -83,7 +83,7 @@ class NodeHandle(Destroyable, Participant):
         try:
             self.arguments = RosArguments(["--ros-args", *cli_args] if cli_args else [])
         except UnknownArgumentsError as error:
-            raise real.UnknownROSArgsError(str(error)) from error
+            raise real.UnknownROSArgsError(str(error.unknown)) from error
         except InvalidArgumentsError as error:
             message = f"Failed to parse ROS arguments: {error}"
             raise real.RCLInvalidROSArgsError(message) from error
