@@ -18,7 +18,7 @@ from rsltrace.compiled import TimerQueueFields, TimerStateFields
 # the timer was started on; periods that were missed are skipped, not made up for.
 
 ZERO_PERIOD_NS = 1_000_000
-"""How often a timer of period 0 or less runs, which ROS runs whenever the executor comes to it.
+"""How often a timer of period 0 runs, which ROS runs whenever the executor comes to it.
 Rejected: again at the same instant, as simulated time would never go on."""
 
 
@@ -45,7 +45,7 @@ class TimerState(TimerStateFields):
     def call(self, now_ns: int) -> None:
         """Move the deadline to its next grid point after a call at ``now_ns``."""
         self.last_call_ns = now_ns
-        period_ns = self.period_ns if self.period_ns > 0 else ZERO_PERIOD_NS
+        period_ns = self.period_ns or ZERO_PERIOD_NS
         deadline_ns = self.deadline_ns + period_ns
         if deadline_ns <= now_ns:
             deadline_ns += (1 + (now_ns - deadline_ns) // period_ns) * period_ns
@@ -53,7 +53,7 @@ class TimerState(TimerStateFields):
 
     def reset(self, now_ns: int) -> None:
         """Start a new grid at ``now_ns``; a cancelled timer runs again."""
-        self.deadline_ns = now_ns + max(self.period_ns, 0)
+        self.deadline_ns = now_ns + self.period_ns
         self.canceled = False
 
 
