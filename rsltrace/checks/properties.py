@@ -22,8 +22,8 @@ KEPT_MAX = 1000
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """Where a check fails: an event (None: at the end of the run), its time in ns, and what is
-    wrong there."""
+    """Where a check fails: an event (None: at a time, as that of the end), its time in ns, and what
+    is wrong there."""
 
     event: int | None
     stamp_ns: int
@@ -145,7 +145,7 @@ class EventuallyProperty(RunProperty):
         self.advance(stamp_ns if complete else stamp_ns - 1)
         for index, begin_ns in self._waiting:
             if complete and self.within_ns is None:
-                self._missed(index, begin_ns, "before the end of the run")
+                self._missed(index, begin_ns, stamp_ns, "before the end of the run")
             else:
                 self.undecided += 1
 
@@ -155,11 +155,13 @@ class EventuallyProperty(RunProperty):
             return
         while self._waiting and self._waiting[0][1] + self.within_ns <= now_ns:
             index, begin_ns = self._waiting.popleft()
-            self._missed(index, begin_ns, f"within {format_duration(self.within_ns)}")
+            end_ns = begin_ns + self.within_ns
+            self._missed(index, begin_ns, end_ns, f"within {format_duration(self.within_ns)}")
 
-    def _missed(self, index: int | None, begin_ns: int, when: str) -> None:
+    def _missed(self, index: int | None, begin_ns: int, end_ns: int, when: str) -> None:
         since = "" if index is None or index < 0 else f" of event {index}"
-        self._violated(index, begin_ns, f"it does not happen {when}{since}")
+        at_ns = end_ns if index is None else begin_ns
+        self._violated(index, at_ns, f"it does not happen {when}{since}")
 
 
 @dataclass

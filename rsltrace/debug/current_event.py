@@ -140,9 +140,10 @@ class CurrentEventView:
         return self._domain.loop.now_ns
 
     def nodes(self) -> Mapping[str, object]:
+        """Return the nodes by name, also those that no executor spins yet."""
         found = {}
         for handle in self._domain.graph.nodes:
-            node = getattr(handle, "wrapper", None)
+            node = getattr(handle, "made", None)
             if node is not None:
                 found[handle.key] = node
         return found

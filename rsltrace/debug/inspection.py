@@ -273,10 +273,13 @@ def _plain_parts(value: object) -> Mapping[str, Any]:
 
 
 def nodes(run: StoppedRun) -> list[dict[str, Any]]:
-    return [
+    found = [
         {"name": name, "class": f"{type(node).__module__}.{type(node).__qualname__}"}
         for name, node in run.view.nodes().items()
     ]
+    for one in processes(run):
+        found += [{"name": name, "class": f"in process {one['pid']}"} for name in one["nodes"]]
+    return found
 
 
 def queues(run: StoppedRun) -> list[dict[str, Any]]:

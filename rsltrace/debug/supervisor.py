@@ -103,13 +103,14 @@ class Supervisor:
         return answer
 
     def _node(self, request: Message) -> str:
-        """Return the full name of the requested node, by default that of the last event."""
+        """Return the full name of the requested node, by default that of the event that is shown:
+        the one about to run, or the last."""
         name = request.get("node")
         if name is not None:
             return str(self.tree.ask_cursor({"do": "node name", "name": name}))
-        event = self.tree.position["event"]
+        event = self.tree.position.get("next") or self.tree.position["event"]
         if event is None or not event["node"]:
-            raise DebugError("the last event belongs to no node: give a node")
+            raise DebugError("this event belongs to no node: give a node")
         return str(event["node"])
 
     def _place(self, place: int | str) -> Message:
@@ -130,7 +131,7 @@ class Supervisor:
         goal = self._place(request["to"])
         here = self._index if "until" in goal else int(self.tree.position["stamp_ns"])
         if next(iter(goal.values())) < here:
-            raise DebugError(f"{request['to']} is in the past: go_to goes back")
+            raise DebugError(f"{request['to']} is in the past: use goto (in Python, go_to)")
         return self._forward(**goal)
 
     def _reverse_step(self, request: Message) -> Message:

@@ -201,12 +201,15 @@ class NodeObserver:
         return self._entities.add(keys, node, kind, name, named, runs=callback, **detail)
 
     def _timer(self, node: ObservedEntity, timer: Any) -> None:
+        from rclpy.timer import Rate
+
+        callback = Rate if timer.callback is None else timer.callback  # a Rate sets it later
         self._entities.add(
             (timer, timer.handle),
             node,
             EntityKind.TIMER,
-            callback_name(timer.callback),
-            runs=timer.callback,
+            callback_name(callback),
+            runs=callback,
             period_ns=timer.timer_period_ns,
         )
 

@@ -219,7 +219,9 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
     if own is not None:
         own = _following_native(own, job)
     if own is None:
-        return f"there is no {name} in {folder} to compare its job with without running code"
+        if (folder / name).exists():  # a launch file in Python
+            return f"its job is {name}, which cannot be compared with it without running code"
+        return f"there is no {name} in {folder} to compare its job with"
     differing = _differing(own, job)
     if differing:
         return f"its job differs from {folder / name} in {', '.join(differing)}"

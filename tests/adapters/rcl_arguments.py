@@ -166,7 +166,7 @@ class RosArguments:
         if code != _OK:
             raise InvalidArgumentsError(self._error(f"rcl refuses the arguments (code {code})"))
         if self._rcl.rcl_arguments_get_count_unparsed_ros(byref(self._parsed)) > 0:
-            raise UnknownArgumentsError(f"unknown ROS arguments: {self._unknown()}")
+            raise UnknownArgumentsError(self._unknown())
 
     def _unknown(self) -> list[str]:
         count = self._rcl.rcl_arguments_get_count_unparsed_ros(byref(self._parsed))

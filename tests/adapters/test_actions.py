@@ -255,6 +255,26 @@ def test_goals_whose_execution_is_deferred(simulate: Any) -> None:
 
 
 @pytest.mark.long
+def test_a_destroyed_client_and_a_bad_name_raise_what_rclpy_raises(simulate: Any) -> None:
+    class Gone(Node):
+        def __init__(self) -> None:
+            super().__init__("gone")
+            client = ActionClient(self, Fibonacci, "count")
+            client.destroy()
+            with pytest.raises(RuntimeError, match="Failed to send goal request: action client po"):
+                client.send_goal_async(Fibonacci.Goal())
+            with pytest.raises(RuntimeError, match="Failed to check if action server is available"):
+                client.wait_for_server(timeout_sec=0.1)
+            for make in (
+                lambda: ActionClient(self, Fibonacci, "x y"),
+                lambda: ActionServer(self, Fibonacci, "x y", print),
+            ):
+                with pytest.raises(ValueError, match="due to invalid topic name 'x y'"):
+                    make()
+
+    simulate(Gone, duration=1)
+
+
 def test_goal_ids_come_from_the_seed(simulate: Any) -> None:
     def goal_ids(seed: int) -> list[str]:
         seen: list[str] = []

@@ -18,6 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from rsltrace.adapters.rclpy.concurrency import blocking_calls as simulated_waiting
 from rsltrace.errors import DeadlockError, NodeError
+from rsltrace.trace.model.entity import EntityKind
 
 pytestmark = pytest.mark.ros
 
@@ -208,7 +209,10 @@ def test_sleeping_lets_others_run_and_keeps_the_group_busy(simulate: Any) -> Non
 
     for method in ("time", "clock", "rate"):
         log.clear()
-        simulate(lambda method=method: Sleeper(method), duration=1.7)
+        recorded = simulate(lambda method=method: Sleeper(method), duration=1.7)
+        with recorded.trace() as trace:
+            timers = {e.name for e in trace.entities.values() if e.kind is EntityKind.TIMER}
+        assert "Rate" in timers
         assert log == [
             ("same", 0.4),
             ("other", 0.4),

@@ -274,6 +274,33 @@ def test_a_service_call_on_ones_own_single_threaded_executor_is_a_deadlock(simul
         simulate(main_spec(program))
 
 
+def test_domains_of_one_program_are_noted_as_they_meet(simulate: Any) -> None:
+    def program() -> None:
+        for domain in (0, 3):
+            context = rclpy.context.Context()
+            rclpy.init(context=context, domain_id=domain)
+            found = Node(f"in_{domain}", context=context).get_node_names()
+        assert found == ["in_0", "in_3"]
+
+    notes = simulate(main_spec(program)).result.notes
+    assert any("has nodes in domains [0, 3], which meet in a simulation" in note for note in notes)
+
+
+def test_arguments_that_rcl_refuses_raise_what_rclpy_raises(simulate: Any) -> None:
+    from rclpy.impl.implementation_singleton import rclpy_implementation as real
+
+    def program() -> None:
+        with pytest.raises(real.UnknownROSArgsError, match=r"^\['--bogus'\]$"):
+            rclpy.init(args=["--ros-args", "--bogus"])
+        for arguments in ("abc", [3]):
+            with pytest.raises(TypeError):
+                rclpy.init(args=arguments)  # type: ignore[arg-type]
+        with pytest.raises(real.RCLError, match="failed to initialize rcl: Couldn't parse remap"):
+            rclpy.init(args=["--ros-args", "-r", "::"], context=rclpy.context.Context())
+
+    simulate(main_spec(program))
+
+
 def test_a_rate_of_a_node_that_nobody_spins_is_a_deadlock_that_says_so(simulate: Any) -> None:
     """As natively: its timer is nobody's."""
 
@@ -605,7 +632,7 @@ def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) ->
 
 @pytest.mark.long
 def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any) -> None:
-    from rclpy.action import ActionClient
+    from rclpy.action import ActionClient, get_action_names_and_types
     from rclpy.impl.implementation_singleton import rclpy_implementation
     from test_msgs.action import Fibonacci
 
@@ -638,6 +665,11 @@ def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any
             node.get_node_names,
             node.get_topic_names_and_types,
             lambda: node.count_publishers("numbers"),
+            lambda: node.get_publishers_info_by_topic("numbers"),
+            lambda: node.get_client_names_and_types_by_node(node.get_name(), "/"),
+            lambda: get_action_names_and_types(node),
+            node.publisher.assert_liveliness,
+            node.publisher.wait_for_all_acked,
             context.handle.shutdown,
         ):
             with pytest.raises(rclpy_implementation.RCLError) as error:
@@ -651,9 +683,23 @@ def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any
         lambda: listener(heard),
         duration=1.2,  # type: ignore[arg-type]
     )
-    assert refused[0] == "Failed to publish: publisher's context is invalid"
+    assert refused[:2] == [
+        "Failed to publish: publisher's context is invalid",
+        "failed to get subscription count: publisher's context is invalid",
+    ]
+    node_is_down = "rcl node's context is invalid"
+    assert refused[3] == f"Failed to create publisher: {node_is_down}"
+    assert refused[11:-1] == [
+        f"Failed to get node names: {node_is_down}",
+        f"failed to get topic names and types: {node_is_down}",
+        f"Error in rcl_count_publishers: {node_is_down}",
+        f"Failed to get information by topic for publishers: {node_is_down}",
+        f"failed to get client names and types: {node_is_down}",
+        f"Failed to get action names and type: {node_is_down}",
+        "Failed to assert liveliness on the Publisher: publisher's context is invalid",
+        "Failed to wait for all acknowledgements: publisher's context is invalid",
+    ]
     assert refused[-1].startswith("failed to shutdown: rcl_shutdown already called")
-    assert len(refused) == 15
     assert [number for number, _ in heard] == [1, 2]  # type: ignore[misc]
 
 

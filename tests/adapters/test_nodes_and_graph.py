@@ -247,6 +247,8 @@ def test_log_levels_of_one_run_do_not_leak_into_the_next(simulate: Any) -> None:
 
 
 def test_graph_queries(simulate: Any) -> None:
+    from rclpy.node import NodeNameNonExistentError
+
     seen: dict[str, Any] = {}
 
     class Server(Node):
@@ -273,10 +275,17 @@ def test_graph_queries(simulate: Any) -> None:
             )
             info = self.get_publishers_info_by_topic("/a/numbers")[0]
             seen["info"] = (info.node_name, info.node_namespace, info.topic_type)
-            seen["depth"] = info.qos_profile.depth
+            seen["queue"] = info.qos_profile.history.name, info.qos_profile.depth
             seen["hash"] = str(info.topic_type_hash)
             names = self.get_publisher_names_and_types_by_node("server", "/a")
             seen["by_node"] = dict(names)["/a/numbers"]
+
+            with pytest.raises(NodeNameNonExistentError, match="cannot get service names and ty"):
+                self.get_service_names_and_types_by_node("nobody", "/")
+            with pytest.raises(RuntimeError, match="failed to get service names and types: node n"):
+                self.get_service_names_and_types_by_node("no body", "/")
+            with pytest.raises(RuntimeError, match="failed to resolve name: topic name must not c"):
+                self.resolve_topic_name("not valid")
 
     simulate(Server, Curious, duration=1)
     assert seen == {
@@ -286,7 +295,7 @@ def test_graph_queries(simulate: Any) -> None:
         "services": ["std_srvs/srv/Trigger"],
         "counts": (1, 1, 1, 1, 0),
         "info": ("server", "/a", "std_msgs/msg/UInt64"),
-        "depth": 3,
+        "queue": ("UNKNOWN", 0),  # as DDS does not tell them
         "hash": "RIHS01_fbdc52018fc13755dce18024d1a671c856aa8b4aaf63adfb095b608f98e8c943",
         "by_node": ["std_msgs/msg/UInt64"],
     }

@@ -338,3 +338,22 @@ def test_a_topic_may_have_another_type_later(simulate: Any) -> None:
             trace.decode(trace.channel_of(output), trace.payload(output)[2]).data for output in sent
         ]
     assert said == ["first", 7]
+
+
+def test_best_available_sets_no_deadline(simulate: Any) -> None:
+    from rclpy.qos import QoSPresetProfiles
+
+    heard: list[int] = []
+
+    class Best(Node):
+        def __init__(self) -> None:
+            super().__init__("best")
+            self.out = self.create_publisher(UInt64, "n", 1)
+            best = QoSPresetProfiles.BEST_AVAILABLE.value
+            self.create_subscription(UInt64, "n", lambda m: heard.append(m.data), best)
+            deadline = self.get_subscriptions_info_by_topic("/n")[0].qos_profile.deadline
+            assert str(deadline) == "Infinite"
+            self.create_timer(1.0, lambda: self.out.publish(UInt64(data=7)))
+
+    simulate(Best, duration=1)
+    assert heard == [7]

@@ -59,16 +59,20 @@ def test_always_and_never_agree_with_the_messages(limit: float, text: str) -> No
 
 
 def test_what_has_to_follow_in_time() -> None:
-    soon, late, rare = checked(
+    soon, late, rare, early = checked(
         {"eventually": "/cmd_vel", "after": "/scan: min(ranges) < 2", "within": "1ns"},
         {"eventually": "/scan", "after": "/cmd_vel", "within": "90ms"},
         {"eventually": "exception"},
+        {"eventually": "exception", "within": "90ms"},
     )
     assert soon.verdict == "passed"
     assert late.verdict == "violated"
     assert late.violations[0].event is not None
     assert "within 90 ms of event" in late.violations[0].text
     assert (rare.verdict, rare.violations[0].event) == ("violated", None)
+    with Trace.open(A) as trace:  # when it was too late
+        assert rare.violations[0].stamp_ns == trace.end_ns
+        assert early.violations[0].stamp_ns == trace.start_ns + 90_000_000
 
 
 ROVER = SAMPLE.parent / "delayed_input" / "b.mcap"

@@ -123,6 +123,32 @@ def test_next_and_reverse_next_stay_in_a_node(session: DebugSession) -> None:
         session.next("filtr")
 
 
+def test_next_is_of_the_node_whose_event_is_about_to_run(session: DebugSession) -> None:
+    session.run_to(200)
+    session.break_at("node /watch")
+    here = session.go_on().position
+    assert here.is_next
+    assert here.event is not None
+    assert here.event["node"] != "/watch"
+    after = session.next().position
+    assert (after.index, after.is_next) == (here.index + 1, False)
+
+
+def test_the_nodes_of_a_main_are_there_before_it_spins(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(
+        "import rclpy\n\n"
+        "rclpy.init()\n"
+        "node = rclpy.create_node('early')\n"
+        "node.level = 7\n"
+        "node.get_clock().sleep_for(rclpy.duration.Duration(seconds=1))\n"
+        "rclpy.spin(node)\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{script: program.py}]\nstop: {duration: 2s}\n")
+    with DebugSession(tmp_path / "job.yaml") as session:
+        session.step()
+        assert session.evaluate("early.level") == 7
+
+
 @pytest.mark.long
 def test_breakpoints_stop_forwards_and_backwards(session: DebugSession) -> None:
     too_fast = session.break_at("log warn /fast/")

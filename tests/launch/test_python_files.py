@@ -476,7 +476,7 @@ def test_a_run_of_a_python_launch_file(
     assert again.returncode == 0, again.stderr
     unasked = command("replay", "bringup.mcap")
     assert unasked.returncode == 2
-    assert "without running code" in unasked.stderr
+    assert "its job is bringup.launch.py, which cannot be compared with it" in unasked.stderr
     assert not Path("ran").exists()
 
 

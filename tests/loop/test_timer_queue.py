@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from rsltrace.simulation.loop.timer_queue import (
     NEVER_NS,
+    ZERO_PERIOD_NS,
     CreationOrderQueue,
     HeapOrderQueue,
     TimerState,
@@ -46,10 +47,13 @@ def test_a_timer_called_before_it_is_due_skips_to_the_deadline_after() -> None:
     assert state.deadline_ns == 200
 
 
-def test_a_timer_without_period_is_always_due() -> None:
+def test_a_timer_without_period_is_due_at_once_and_then_every_millisecond() -> None:
     state = timer(0, 0)
+    assert state.deadline_ns == 0
     state.call(5)
-    assert state.deadline_ns == 5
+    assert state.deadline_ns == ZERO_PERIOD_NS
+    state.call(ZERO_PERIOD_NS)
+    assert state.deadline_ns == 2 * ZERO_PERIOD_NS
 
 
 def test_a_negative_period_is_refused() -> None:

@@ -207,6 +207,7 @@ class Nested(Node):
         self.done = self.create_publisher(String, "/done", 10)
         self.inner = rclpy.create_node("inner")
         self.asks = self.inner.create_client(Trigger, "/ask")
+        self.rate = self.create_rate(1.0)
         self.timer = self.create_timer(0.05, self.on_timer)
 
     def on_timer(self) -> None:

@@ -107,6 +107,7 @@ def test_every_kind_of_callback_is_there(graph: tuple[Trace, str]) -> None:
     assert len(logs) >= 1
     names = {e.name for e in trace.entities.values() if e.kind is EntityKind.NODE}
     assert {"/fast", "/talker100000", "/listener", "/inner"} <= names
+    assert "Rate" in {e.name for e in trace.entities.values() if e.kind is EntityKind.TIMER}
 
 
 def test_the_causes_are_right(graph: tuple[Trace, str]) -> None:

@@ -508,3 +508,13 @@ def test_a_process_finds_the_libraries_of_the_prefixes_that_are_sourced(tmp_path
     ).environment
     found = made["LD_LIBRARY_PATH"].split(":")
     assert found[-2:] == [f"{tmp_path}/known/lib", f"{tmp_path}/has/lib"]
+
+
+def test_a_debugging_session_lists_the_nodes_of_processes(counter: Path, tmp_path: Path) -> None:
+    _job(tmp_path, counter)
+    with rsltrace.DebugSession(tmp_path / "job.yaml") as session:
+        session.run_to("0.2s")
+        kinds = {one["name"]: one["class"] for one in session.inspect("nodes")}
+        (process,) = session.inspect("processes")
+    assert kinds["/counter"] == f"in process {process['pid']}"
+    assert kinds["/echo"] == "echo_node.Echo"

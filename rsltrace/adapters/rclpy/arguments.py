@@ -25,7 +25,11 @@ class InvalidArgumentsError(ValueError):
 
 
 class UnknownArgumentsError(InvalidArgumentsError):
-    """rcl does not know some of the ROS arguments; the text lists them."""
+    """rcl does not know some of the ROS arguments."""
+
+    def __init__(self, unknown: list[str]) -> None:
+        super().__init__(f"unknown ROS arguments: {unknown}")
+        self.unknown = unknown
 
 
 class _Lexeme(IntEnum):
@@ -278,7 +282,7 @@ class RosArguments:
             elif word not in _SWITCHES:
                 unknown.append(word)
         if unknown:
-            raise UnknownArgumentsError(f"unknown ROS arguments: {unknown}")
+            raise UnknownArgumentsError(unknown)
 
     def _deprecated_rule(self, word: str) -> None:
         try:

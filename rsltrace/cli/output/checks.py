@@ -99,10 +99,10 @@ class CheckReport:
         }
 
     def _where(self, found: Violation) -> str:
-        at = "at the end" if found.event is None else f"event {found.event}"
+        at = "at" if found.event is None else f"event {found.event},"
         place = "" if found.event is None else self._places.get(found.event, "")
         return printable(
-            f"{at}, {format_seconds(found.stamp_ns - self._start_ns)} s{place}: {found.text}"
+            f"{at} {format_seconds(found.stamp_ns - self._start_ns)} s{place}: {found.text}"
         )
 
 

@@ -17,6 +17,10 @@ from rsltrace.compiled import TimerQueueFields, TimerStateFields
 # Source of the rules: ``rcl/src/rcl/timer.c`` of rcl 9.2 (ROS 2 Jazzy). Deadlines stay on the grid
 # the timer was started on; periods that were missed are skipped, not made up for.
 
+ZERO_PERIOD_NS = 1_000_000
+"""How often a timer of period 0 runs, which ROS runs whenever the executor comes to it.
+Rejected: again at the same instant, as simulated time would never go on."""
+
 
 class TimerState(TimerStateFields):
     """Period and deadline of one timer, in nanoseconds of simulated time.
@@ -41,12 +45,10 @@ class TimerState(TimerStateFields):
     def call(self, now_ns: int) -> None:
         """Move the deadline to its next grid point after a call at ``now_ns``."""
         self.last_call_ns = now_ns
-        deadline_ns = self.deadline_ns + self.period_ns
+        period_ns = self.period_ns or ZERO_PERIOD_NS
+        deadline_ns = self.deadline_ns + period_ns
         if deadline_ns <= now_ns:
-            if self.period_ns == 0:
-                deadline_ns = now_ns
-            else:
-                deadline_ns += (1 + (now_ns - deadline_ns) // self.period_ns) * self.period_ns
+            deadline_ns += (1 + (now_ns - deadline_ns) // period_ns) * period_ns
         self.deadline_ns = deadline_ns
 
     def reset(self, now_ns: int) -> None:

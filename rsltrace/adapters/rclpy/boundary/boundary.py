@@ -54,7 +54,7 @@ from rsltrace.errors import UnsupportedError
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.middleware.graph import names_and_types
 from rsltrace.simulation.middleware.publisher import Publisher
-from rsltrace.simulation.middleware.qos.policies import Durability
+from rsltrace.simulation.middleware.qos.policies import Durability, History
 from rsltrace.simulation.middleware.qos.timing import (
     CountStatus,
     IncompatibleQosStatus,
@@ -245,11 +245,12 @@ class RclpyBoundary:
 
     def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
         check_process()
-        with self._argument_errors():
+        with self._argument_errors("failed to initialize rcl: ", self.RCLError):
             context = ContextHandle(self, self.runtime, arguments, domain_id)
         programs = self.runtime.programs
         if programs.main_context is None:
             programs.main_context = context
+        context.note_domains()
         return context
 
     def Node(  # noqa: N802
@@ -278,11 +279,11 @@ class RclpyBoundary:
         )
 
     def Publisher(self, node: NodeHandle, *arguments: Any) -> PublisherHandle:  # noqa: N802
-        node.require_up("failed to create publisher")
+        node.require_up("Failed to create publisher")
         return PublisherHandle(node, *arguments)
 
     def Subscription(self, node: NodeHandle, *arguments: Any) -> SubscriptionHandle:  # noqa: N802
-        node.require_up("failed to create subscription")
+        node.require_up("Failed to create subscription")
         return SubscriptionHandle(node, *arguments)
 
     def Client(self, node: NodeHandle, *arguments: Any) -> ClientHandle:  # noqa: N802
@@ -346,7 +347,8 @@ class RclpyBoundary:
         try:
             return node.resolve(name, service=is_service, only_expand=only_expand)
         except ValueError as error:
-            raise self.RCLError(str(error)) from error
+            reason = str(error).partition(" is invalid: ")[2] or str(error)
+            raise self.RCLError(f"failed to resolve name: {reason}") from error
 
     def rclpy_remap_topic_name(self, node: NodeHandle, topic: str) -> str:
         return node.resolve(topic, service=False)
@@ -354,40 +356,47 @@ class RclpyBoundary:
     def rclpy_get_publisher_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        return topic_types(node.usable_graph.publishers_of(node.node_named(name, namespace)))
+        task = "failed to get publisher names and types"
+        return topic_types(node.ends_of("publishers", task, name, namespace))
 
     def rclpy_get_subscriber_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        return topic_types(node.usable_graph.subscriptions_of(node.node_named(name, namespace)))
+        task = "failed to get subscriber names and types"
+        return topic_types(node.ends_of("subscriptions", task, name, namespace))
 
     def rclpy_get_service_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        return _service_types(node.usable_graph.services_of(node.node_named(name, namespace)))
+        task = "failed to get service names and types"
+        return _service_types(node.ends_of("services", task, name, namespace))
 
     def rclpy_get_client_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        return _service_types(node.usable_graph.clients_of(node.node_named(name, namespace)))
+        task = "failed to get client names and types"
+        return _service_types(node.ends_of("clients", task, name, namespace))
 
     def rclpy_get_topic_names_and_types(
         self, node: NodeHandle, no_demangle: bool
     ) -> list[tuple[str, list[str]]]:
-        return node.usable_graph.topic_names_and_types()
+        return node.usable_graph("failed to get topic names and types").topic_names_and_types()
 
     def rclpy_get_service_names_and_types(self, node: NodeHandle) -> list[tuple[str, list[str]]]:
-        return node.usable_graph.service_names_and_types()
+        task = "failed to get service names and types"
+        return node.usable_graph(task).service_names_and_types()
 
     def rclpy_get_publishers_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(p, _PUBLISHER) for p in node.usable_graph.publishers(topic)]
+        graph = node.usable_graph("Failed to get information by topic for publishers")
+        return [_endpoint_info(p, _PUBLISHER) for p in graph.publishers(topic)]
 
     def rclpy_get_subscriptions_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(s, _SUBSCRIPTION) for s in node.usable_graph.subscriptions(topic)]
+        graph = node.usable_graph("Failed to get information by topic for subscriptions")
+        return [_endpoint_info(s, _SUBSCRIPTION) for s in graph.subscriptions(topic)]
 
     rclpy_expand_topic_name = staticmethod(expand)
     rclpy_get_validation_error_for_full_topic_name = staticmethod(full_topic_fault)
@@ -396,19 +405,18 @@ class RclpyBoundary:
     rclpy_get_validation_error_for_topic_name = staticmethod(topic_fault)
 
     def rclpy_remove_ros_args(self, arguments: list[str] | None) -> list[str]:
-        with self._argument_errors("Failed to parse ROS arguments: "):
+        with self._argument_errors("Failed to parse ROS arguments: ", self.RCLInvalidROSArgsError):
             return RosArguments(arguments or []).others
 
     @contextmanager
-    def _argument_errors(self, prefix: str = "") -> Iterator[None]:
+    def _argument_errors(self, prefix: str, kind: type[Exception]) -> Iterator[None]:
         """Raise rclpy's exceptions for arguments that rcl would refuse."""
         try:
             yield
         except UnknownArgumentsError as error:
-            text = str(error)
-            raise self.UnknownROSArgsError(text.partition(": ")[2] if prefix else text) from error
+            raise self.UnknownROSArgsError(str(error.unknown)) from error
         except InvalidArgumentsError as error:
-            raise self.RCLInvalidROSArgsError(f"{prefix}{error}") from error
+            raise kind(f"{prefix}{error}") from error
 
     # -- QoS ---------------------------------------------------------------------------------------
 
@@ -436,6 +444,8 @@ class RclpyBoundary:
             raise self.RMWError(f"failed to deserialize ROS message: {error}") from None
 
     def rclpy_assert_liveliness(self, publisher: Any) -> None:
+        task = "Failed to assert liveliness on the Publisher"
+        publisher.node.require_up(task, "publisher")
         publisher.assert_liveliness()
 
     def rclpy_get_rmw_implementation_identifier(self) -> str:
@@ -554,6 +564,7 @@ def _service_types(ends: Iterable[ServiceEndpoint]) -> list[tuple[str, list[str]
 
 
 def _endpoint_info(endpoint: Publisher | Subscription, endpoint_type: int) -> dict[str, Any]:
+    """Describe an endpoint as DDS discovers it, without the length of its queue."""
     from rclpy.topic_endpoint_info import TopicEndpointInfo
 
     _, text = endpoint.type.describe()
@@ -567,5 +578,5 @@ def _endpoint_info(endpoint: Publisher | Subscription, endpoint_type: int) -> di
         **({"topic_type_hash": type_hash} if has_hash else {}),
         "endpoint_type": endpoint_type,
         "endpoint_gid": list(endpoint.entity_id.to_bytes(16, "big")),
-        "qos_profile": profile_of(endpoint.qos),
+        "qos_profile": profile_of(endpoint.qos) | {"history": int(History.UNKNOWN), "depth": 0},
     }

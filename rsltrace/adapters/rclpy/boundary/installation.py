@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import math
 import os
 import re
 import sys
@@ -50,6 +51,29 @@ def quick_log_callers() -> Iterator[None]:
             quick = _log_callers_quick(logger, logger.CallerId)
             replace_attribute(stack, logger, "CallerId", quick)
         yield
+
+
+@contextmanager
+def eager_throttles() -> Iterator[None]:
+    """Let a throttle log the first record within the ``with`` block, as in a native run, where
+    clocks that show no simulation time are far from 0."""
+    from rclpy.impl import rcutils_logger
+
+    real: Any = rcutils_logger.Throttle
+
+    class Throttle(real):  # type: ignore[misc]
+        @classmethod
+        def initialize_context(cls, context: Any, **options: Any) -> None:
+            super().initialize_context(context, **options)
+            if not getattr(context["throttle_time_source_type"], "ros_time_is_active", False):
+                context["throttle_last_logged"] = -math.inf
+
+    filters: Any = rcutils_logger.supported_filters
+    filters["throttle"] = Throttle
+    try:
+        yield
+    finally:
+        filters["throttle"] = real
 
 
 def _log_callers_quick(logger: Any, real: Any) -> Any:
@@ -408,7 +432,15 @@ def installed() -> Iterator[RclpyBoundary]:
     ours = boundary()
     _bind(ours)
     try:
-        with quick_log_callers(), quick_id_texts(), quick_publish(), callback_as_attribute():
+        with ExitStack() as stack:
+            for change in (
+                quick_log_callers,
+                eager_throttles,
+                quick_id_texts,
+                quick_publish,
+                callback_as_attribute,
+            ):
+                stack.enter_context(change())
             yield ours
     finally:
         _bind(ours.real or ours)

@@ -37,6 +37,9 @@ class ProgramContext(Protocol):
     def end(self) -> None:
         """Shut down from outside, as a signal does."""
 
+    def get_domain_id(self) -> int:
+        """Return the number of its DDS domain."""
+
 
 class SimulatedPrograms:
     """The simulated processes: ``present`` runs, ``host`` has the nodes that the job constructs,

@@ -153,7 +153,13 @@ class ActionHandle(Handle):
         self.runtime = node.runtime
         self._functions = FunctionRecorder(node.dispatcher)
         self.node = node
-        self.name = node.resolve(name, service=False)
+        try:
+            self.name = node.resolve(name, service=False)
+        except ValueError as error:
+            what = "client" if self.is_client else "server"
+            _, _, reason = str(error).partition(" is invalid: ")
+            text = f"Failed to create action {what} due to invalid topic name '{name}' : {reason}"
+            raise ValueError(text) from error
         self.parts: list[ActionEndpoint] = []
         self.publishers: list[PublisherHandle] = []
         self.action_type = action_type
@@ -276,7 +282,9 @@ class ActionClientHandle(ActionHandle):
 
     def is_action_server_available(self) -> bool:
         """Return whether a server has all of its services and topics."""
-        graph = self.node.usable_graph
+        task = "Failed to check if action server is available"
+        self._require_alive(task, "rcl node")
+        graph = self.node.usable_graph(task)
         services = (self._goal, self._cancel, self._result)
         topics = (self._feedback, self._status)
         return all(graph.services(part.service) for part in services) and all(
@@ -291,8 +299,13 @@ class ActionClientHandle(ActionHandle):
         )
         return feedback, status, goal, cancel, result
 
+    def _require_alive(self, task: str, whose: str) -> None:
+        if self.destroyed:
+            raise self.node.real.RCLError(f"{task}: {whose} pointer is invalid")
+
     def _send_request(self, client: str, request: Any) -> int:
         """Send a request; return its sequence number."""
+        self._require_alive(f"Failed to send {client[1:]} request", "action client")
         return int(getattr(self, client).send_request(request))
 
     send_goal_request = partialmethod(_send_request, "_goal")

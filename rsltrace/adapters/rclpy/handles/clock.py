@@ -5,6 +5,7 @@ If the job says so, ROS time is that of ``/clock`` or set by hand, by rcl's rule
 
 from __future__ import annotations
 
+import sys
 import weakref
 from functools import partial
 from typing import Any, Protocol
@@ -49,14 +50,15 @@ class ClockHandle(Handle):
         self.followers: list[ClockFollower] = []
         self._callbacks: list[tuple[Any, bool, int, int]] = []
         self._owner: str | None = self.boundary.current_node_name()
+        self._is_users_own = _caller() != "rclpy.node"
         if clock_type == self.boundary.ClockType.ROS_TIME:
             self.boundary.ros_clocks.append(weakref.ref(self))
 
     @property
     def follows(self) -> bool:
-        """Whether ``/clock`` drives it while ``use_sim_time`` is on."""
+        """Whether ``/clock`` drives it while ``use_sim_time`` is on, or user code that made it."""
         is_ros = self.clock_type == self.boundary.ClockType.ROS_TIME
-        return is_ros and bool(self.boundary.follows(self._owner))
+        return is_ros and (self._is_users_own or bool(self.boundary.follows(self._owner)))
 
     @property
     def is_driven(self) -> bool:
@@ -71,11 +73,18 @@ class ClockHandle(Handle):
         """Return what the node's clock shows, without counting as a reading."""
         return self._set_ns if self.is_driven else int(self.boundary.shown_ns(self._owner))
 
+    def _require_ros(self, task: str, what: str) -> None:
+        if self.clock_type != self.boundary.ClockType.ROS_TIME:
+            reason = f"Clock is not of type RCL_ROS_TIME, cannot {what}."
+            raise self.boundary.RCLError(f"failed to {task}: {reason}")
+
     def get_ros_time_override_is_enabled(self) -> bool:
         """Return whether ``use_sim_time`` is on for this clock."""
+        self._require_ros("get ROS time override status", "query override state")
         return self._override
 
     def set_ros_time_override_is_enabled(self, enabled: bool) -> None:
+        self._require_ros("set ROS time override", "enable override")
         if enabled == self._override:
             return
         changes = self.boundary.ClockChange
@@ -88,7 +97,9 @@ class ClockHandle(Handle):
             follower.time_changed(switched=True)
 
     def set_ros_time_override(self, time_point: Any) -> None:
-        """Set ROS time, if ``/clock`` drives it."""
+        """Set ROS time, if ``/clock`` or user code drives it."""
+        if self._is_users_own and _caller() == "rclpy.time_source":
+            self._is_users_own = False  # attached to that of a node
         if not self.follows:
             if self._override:
                 self.boundary.note_ignored_time()
@@ -139,6 +150,14 @@ class ClockHandle(Handle):
         for jump_handle, *_ in entries:
             if jump_handle._post_callback is not None:
                 jump_handle._post_callback({"clock_change": change, "delta": delta_ns})
+
+
+def _caller() -> str:
+    """Return the module that uses ``rclpy.clock``."""
+    frame = sys._getframe(2)
+    while frame.f_back is not None and frame.f_globals.get("__name__") == "rclpy.clock":
+        frame = frame.f_back
+    return str(frame.f_globals.get("__name__"))
 
 
 class ClockEventHandle:

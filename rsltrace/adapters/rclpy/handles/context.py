@@ -32,13 +32,15 @@ class ContextHandle(Handle):
         super().__init__()
         self._real = real
         self.runtime = runtime
+        if not isinstance(arguments, list):
+            raise TypeError("Context: incompatible constructor arguments: the first must be a list")
         for argument in arguments:
-            argument.encode()  # raises what rclpy raises for invalid text
+            str.encode(argument)  # raises what rclpy raises for invalid text
         self.program = runtime.programs.present
-        self.program.contexts.append(self)
         self.arguments = RosArguments([*_only_ros(arguments), *self.program.ros_words])
         self._domain_id = 0 if domain_id == DEFAULT_DOMAIN else domain_id
         self.is_up = True
+        self.program.contexts.append(self)
 
     def ok(self) -> bool:
         return self.is_up
@@ -46,6 +48,14 @@ class ContextHandle(Handle):
     def get_domain_id(self) -> int:
         """Return the domain id; nothing in a simulation depends on it."""
         return self._domain_id
+
+    def note_domains(self) -> None:
+        """Note that domains do not separate the nodes of a program, if it has several."""
+        domains = sorted({each.get_domain_id() for each in self.program.contexts if each.ok()})
+        notes = self.runtime.domain.outcome.notes
+        note = f"{self.program.name} has nodes in domains {domains}, which meet in a simulation"
+        if len(domains) > 1 and note not in notes:
+            notes.append(note)
 
     def shutdown(self) -> None:
         """Shut down. Within an event this ends the run once the event is over."""

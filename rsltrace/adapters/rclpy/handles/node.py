@@ -21,6 +21,7 @@ from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
+from rsltrace.adapters.rclpy.names import namespace_fault, node_name_fault
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.event import NameRequester
 from rsltrace.simulation.middleware.graph import Graph, action_names_and_types, names_and_types
@@ -82,7 +83,7 @@ class NodeHandle(Destroyable, Participant):
         try:
             self.arguments = RosArguments(["--ros-args", *cli_args] if cli_args else [])
         except UnknownArgumentsError as error:
-            raise real.UnknownROSArgsError(str(error)) from error
+            raise real.UnknownROSArgsError(str(error.unknown)) from error
         except InvalidArgumentsError as error:
             message = f"Failed to parse ROS arguments: {error}"
             raise real.RCLInvalidROSArgsError(message) from error
@@ -212,56 +213,66 @@ class NodeHandle(Destroyable, Participant):
         return {name: parameter_class(name, value=value) for name, value in values.items()}
 
     def get_count_publishers(self, topic: str) -> int:
-        return len(self.usable_graph.publishers(topic))
+        return len(self.usable_graph("Error in rcl_count_publishers").publishers(topic))
 
     def get_count_subscribers(self, topic: str) -> int:
-        return len(self.usable_graph.subscriptions(topic))
+        return len(self.usable_graph("Error in rcl_count_subscribers").subscriptions(topic))
 
     def get_count_clients(self, service: str) -> int:
-        return len(self.usable_graph.clients(service))
+        return len(self.usable_graph("Error in rcl_count_clients").clients(service))
 
     def get_count_services(self, service: str) -> int:
-        return len(self.usable_graph.services(service))
+        return len(self.usable_graph("Error in rcl_count_services").services(service))
 
     def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        return [(node.name, node.namespace) for node in self.usable_graph.nodes]
+        graph = self.usable_graph("Failed to get node names")
+        return [(node.name, node.namespace) for node in graph.nodes]
 
     def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
-        return [(node.name, node.namespace, "/") for node in self.usable_graph.nodes]
+        return [(*node, "/") for node in self.get_node_names_and_namespaces()]
 
     def get_action_names_and_types(self) -> list[tuple[str, list[str]]]:
-        return action_names_and_types(self.usable_graph.topic_names_and_types())
+        graph = self.usable_graph("Failed to get action names and type")
+        return action_names_and_types(graph.topic_names_and_types())
 
     def get_action_client_names_and_types_by_node(
         self, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        ends = self.usable_graph.subscriptions_of(self.node_named(name, namespace))
+        task = "Failed to get action client names and type"
+        ends = self.ends_of("subscriptions", task, name, namespace)
         return action_names_and_types(topic_types(ends))
 
     def get_action_server_names_and_types_by_node(
         self, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        ends = self.usable_graph.publishers_of(self.node_named(name, namespace))
+        task = "Failed to get action server names and type"
+        ends = self.ends_of("publishers", task, name, namespace)
         return action_names_and_types(topic_types(ends))
 
-    def node_named(self, name: str, namespace: str) -> Participant:
-        """Return a participant of the graph. Raises NodeNameNonExistentError if there is none."""
-        found = self.usable_graph.node_named(full_name(namespace, name))
+    def ends_of(self, ends: str, task: str, name: str, namespace: str) -> Iterable[Any]:
+        """Return the ``publishers``, ``subscriptions``, ``services`` or ``clients`` of a node.
+        Raises NodeNameNonExistentError if there is none of this name."""
+        graph = self.usable_graph(task)
+        fault = node_name_fault(name) or namespace_fault(namespace or "/")
+        if fault is not None:
+            raise self.real.RCLError(f"{task}: {fault[0]}")
+        found = graph.node_named(full_name(namespace, name))
         if found is None:
+            reason = f"{task.replace('failed to', 'cannot')} for nonexistent node"
             missing = full_name(namespace, name)
-            raise self.real.NodeNameNonExistentError(f"cannot find node {missing}")
-        return found
+            raise self.real.NodeNameNonExistentError(f"{reason}: {missing}")
+        listed: Iterable[Any] = getattr(graph, f"{ends}_of")(found)
+        return listed
 
-    @property
-    def usable_graph(self) -> Graph:
-        """The graph, for calls of user code. Raises RCLError if the context is shut down."""
-        self.require_up("failed to ask the graph")
+    def usable_graph(self, task: str) -> Graph:
+        """Return the graph, for calls of user code. Raises RCLError if the context is shut down."""
+        self.require_up(task)
         return self.runtime.domain.graph
 
-    def require_up(self, task: str) -> None:
+    def require_up(self, task: str, whose: str = "rcl node") -> None:
         """Raise RCLError if the node's context is shut down, as rcl does for ``task``."""
         if not self.context.is_up:
-            raise self.real.RCLError(f"{task}: rcl node's context is invalid")
+            raise self.real.RCLError(f"{task}: {whose}'s context is invalid")
 
     # -- the trace -----------------------------------------------------------------------------
 

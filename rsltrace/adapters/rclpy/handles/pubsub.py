@@ -112,12 +112,13 @@ class PublisherHandle(EntityHandle, Publisher):
         return self.topic
 
     def get_subscription_count(self) -> int:
-        self.node.require_up("failed to get subscription count")
+        self.node.require_up("failed to get subscription count", "publisher")
         return len(self.subscriptions)
 
     def wait_for_all_acked(self, timeout: Any) -> bool:
         """Wait until all messages have reached every reliable subscription; return whether they
         have."""
+        self.node.require_up("Failed to wait for all acknowledgements", "publisher")
         limit_ns: int = timeout.nanoseconds
         left_ns = self.acknowledged_ns() - self.runtime.loop.now_ns
         if left_ns <= 0 or limit_ns == 0:

@@ -48,7 +48,8 @@ def profile_of(qos: Qos) -> dict[str, Any]:
 
 
 def _limit(duration_ns: int) -> int:
-    return 0 if duration_ns >= INFINITE_NS else int(duration_ns)
+    """Return 0 for a duration that is infinite or "best available", a nanosecond less."""
+    return 0 if duration_ns >= INFINITE_NS - 1 else int(duration_ns)
 
 
 # The words of ``rmw_qos_profile_check_compatible``. Of each policy: what a publisher offers and a

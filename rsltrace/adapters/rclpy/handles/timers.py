@@ -7,6 +7,7 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import SimEvent
 from rsltrace.adapters.rclpy.concurrency.callback_groups import is_busy
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
@@ -24,7 +25,7 @@ class TimerHandle(EntityHandle, Timer, TimerFields):
     lists = "timers"
 
     def __init__(self, real: Any, runtime: Runtime, period_ns: int, autostart: bool) -> None:
-        if period_ns < 0:
+        if _int64(period_ns, "__init__(): incompatible constructor") < 0:
             raise real.RCLError("failed to create timer: timer period must be non-negative")
         self.runtime = runtime
         self._real = real
@@ -85,6 +86,15 @@ class TimerHandle(EntityHandle, Timer, TimerFields):
         """Does the usual case, a free group and a plain function of a node that the loop runs, and
         leaves the others to ``dispatch_any``."""
 
+    def user_callback(self) -> object:
+        """Return its callback, or rclpy's class ``Rate`` for the timer of one."""
+        callback = super().user_callback()
+        if isinstance(getattr(callback, "__self__", None), SimEvent):
+            from rclpy.timer import Rate
+
+            return Rate
+        return callback
+
     def forget_callback(self) -> None:
         """Look up how to run the callback again."""
         self._callback = None
@@ -124,10 +134,8 @@ class TimerHandle(EntityHandle, Timer, TimerFields):
         self.reset()
 
     def change_timer_period(self, period_ns: int) -> None:
-        """Set the period; the current deadline stays."""
-        if period_ns < 0:
-            raise self._real.RCLError("timer period must be non-negative")
-        self.set_period(period_ns)
+        """Set the period; the current deadline stays. rcl takes a negative one as 0."""
+        self.set_period(max(_int64(period_ns, "change_timer_period(): incompatible function"), 0))
 
     def get_timer_period(self) -> int:
         return self.state.period_ns
@@ -146,6 +154,12 @@ class TimerHandle(EntityHandle, Timer, TimerFields):
 
     def time_since_last_call(self) -> int:
         return self.dispatcher.loop.now_ns - self.state.last_call_ns
+
+
+def _int64(period_ns: int, refusal: str) -> int:
+    if not -(1 << 63) <= period_ns < 1 << 63:
+        raise TypeError(f"{refusal} arguments: {period_ns} ns does not fit into 64 bits")
+    return period_ns
 
 
 def _info_parameter(callback: Any) -> str | None:
@@ -172,7 +186,7 @@ class RosTimerHandle(TimerHandle):
         self, real: Any, runtime: Runtime, clock: ClockHandle, period_ns: int, autostart: bool
     ) -> None:
         self._clock = clock
-        self._credit_ns = 0
+        self._credit_ns: int | None = None
         self._ready = False
         super().__init__(real, runtime, period_ns, autostart)
         if clock.is_driven:
@@ -188,7 +202,7 @@ class RosTimerHandle(TimerHandle):
     def time_changes(self) -> None:
         """Keep the elapsed part of the period: only the rest is waited for in the new time."""
         now_ns = self._clock.now_ns()
-        if now_ns:
+        if now_ns or not self._clock.is_driven:  # simulated time may begin at 0
             self._credit_ns = now_ns - self.state.last_call_ns
 
     def time_changed(self, *, switched: bool) -> None:
@@ -196,9 +210,9 @@ class RosTimerHandle(TimerHandle):
         now_ns = self._clock.now_ns()
         if switched:
             self.dispatcher.loop.timers.remove(self.state)
-            if now_ns and self._credit_ns:
+            if now_ns and self._credit_ns is not None:
                 self._count_from(now_ns - self._credit_ns)
-                self._credit_ns = 0
+                self._credit_ns = None
         elif now_ns < self.state.last_call_ns:
             self._count_from(now_ns)
         self.activate()
