@@ -170,3 +170,29 @@ def test_view_and_rerun_open_at_the_effect(recorded: Callable[..., Path]) -> Non
     diff = rsltrace.diff(recorded(), recorded(speed="1.5"))
     found = marks.marks_of(diff, comparison.runs)
     assert (found.stamp_ns, found.row) == (100_000_000, 3)
+
+
+def test_a_factory_and_what_one_of_its_nodes_did(tmp_path: Path) -> None:
+    """All nodes of a factory come from one event, which is that of the first of them."""
+    from rsltrace.run import run
+
+    made = f"""{NODES}
+
+def make(speed):
+    lidar, follower = Lidar(), Follower()
+    lidar.declare_parameter("speed", speed)
+    follower.speed = speed
+    return [lidar, follower]
+"""
+    (tmp_path / "factory.py").write_text(made)
+    job, traces = tmp_path / "job.yaml", []
+    for speed in ("1.0", "1.5"):
+        nodes = f"[{{node: factory:make, arguments: {{speed: {speed}}}}}]"
+        job.write_text(f"nodes: {nodes}\nstop: {{duration: 1s}}\n")
+        traces.append(tmp_path / f"{speed}.mcap")
+        run(rsltrace.load_job(job), traces[-1])
+    assert rsltrace.diff(*traces).sentence == (
+        "setting nodes.0.arguments.speed 1.0 → 1.5 (job.yaml:1); first effect: /follower published "
+        "a different linear.x and 1 more field on /cmd_vel at 0.1 s (linear.x 2.0 → 3.0 and 1 more "
+        "field)"
+    )
