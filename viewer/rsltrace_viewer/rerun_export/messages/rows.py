@@ -25,8 +25,8 @@ from rsltrace_viewer.rerun_export.messages.shapes import items, numbers
 # Numeric fields of messages as curves: what makes any topic plottable, whatever its type.
 #
 # The numbers that stand together in a message (x, y and z of a position) are one set of curves, at
-# ``TOPIC/pose.pose.position``. Times, large arrays such as covariances and what says how an array is
-# laid out are no curves.
+# ``TOPIC/pose.pose.position``. Times, large arrays such as covariances and the layout of arrays are
+# no curves.
 
 _ITEMS_MAX = 16
 _CURVES_MAX = 32
