@@ -205,7 +205,7 @@ class NodeObserver:
             (timer, timer.handle),
             node,
             EntityKind.TIMER,
-            callback_name(timer.callback),
+            callback_name(timer.callback) or "Rate",  # which gives its timer a callback later
             runs=timer.callback,
             period_ns=timer.timer_period_ns,
         )

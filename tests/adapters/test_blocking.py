@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -16,8 +17,12 @@ from rclpy.node import Node
 from std_msgs.msg import UInt64
 from std_srvs.srv import SetBool, Trigger
 
+import rsltrace
 from rsltrace.adapters.rclpy.concurrency import blocking_calls as simulated_waiting
 from rsltrace.errors import DeadlockError, NodeError
+from rsltrace.run import run
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros
 
@@ -346,3 +351,16 @@ def test_a_callback_that_polls_a_clock_for_long_is_no_livelock(simulate: Any, po
     recorded = simulate(Poller, duration=2.5, job={"livelock_limit": 300, **policy})
     assert len(recorded.events()) > 600
     assert recorded.logs() == ["1.050", "2.050"]
+
+
+def test_the_timer_of_a_rate_is_named_after_it(tmp_path: Path) -> None:
+    """As natively; the line of code is not of the event that stands in for rclpy's."""
+    (tmp_path / "rated.py").write_text(
+        "from rclpy.node import Node\n\n\ndef make():\n"
+        "    node = Node('rated')\n    node.rate = node.create_rate(5.0)\n    return node\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: rated:make}]\nstop: {duration: 1s}\n")
+    run(rsltrace.load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap")
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        (timer,) = [one for one in trace.entities.values() if one.kind is EntityKind.TIMER]
+    assert (timer.name, timer.source) == ("Rate", "")

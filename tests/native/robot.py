@@ -97,6 +97,7 @@ class Server(Node):
 
     def __init__(self) -> None:
         super().__init__("server")
+        self.rate = self.create_rate(10.0)
         self.create_service(Trigger, "/ask", self.on_ask)
         group = ReentrantCallbackGroup()
         ActionServer(self, Fibonacci, "/count", self.on_goal, callback_group=group)

@@ -91,6 +91,7 @@ def test_every_kind_of_callback_is_there(graph: tuple[Trace, str]) -> None:
     met = {(trace.entity(e.entity).name, e.kind) for e in events}
     assert {
         ("Talker.on_timer", EventKind.TIMER),
+        ("Rate", EventKind.TIMER),
         ("/numbers", EventKind.SUBSCRIPTION),
         ("/ask", EventKind.SERVICE),
         ("/ask", EventKind.CLIENT),

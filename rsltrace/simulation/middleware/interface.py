@@ -71,7 +71,8 @@ _WRAPPED_MAX = 50
 
 
 def callback_source(callback: object) -> str:
-    """Return ``package/module.py:24`` of the function that a callback runs in the end, or "".
+    """Return ``package/module.py:24`` of the function that a callback runs in the end, or "" if it
+    is unknown or our own.
 
     The line is that of ``def``, or of its first decorator. The file is named as it is imported, so
     that traces do not differ by the folder in which they were made.
@@ -80,9 +81,9 @@ def callback_source(callback: object) -> str:
     if found is None:
         return ""
     code, names = found
-    return (
-        f"{imported_file(code, names)}:{code.co_firstlineno}" if code.co_filename[:1] != "<" else ""
-    )
+    if code.co_filename[:1] == "<" or str(names.get("__name__")).startswith("rsltrace."):
+        return ""
+    return f"{imported_file(code, names)}:{code.co_firstlineno}"
 
 
 def callback_code(callback: object) -> tuple[CodeType, Mapping[str, object]] | None:

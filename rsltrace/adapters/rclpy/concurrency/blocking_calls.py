@@ -249,6 +249,8 @@ class SimEvent:
         for blocked in waits:
             blocked.wake()
 
+    set.__qualname__ = "Rate"  # the timer of a Rate has it as its callback, and is named after it
+
     def clear(self) -> None:
         self._set = False
 
