@@ -174,7 +174,11 @@ class Relevance:
         """Whether a module is one that the nodes may use: not that of other nodes alone."""
         if any(module in self._used_by(main) for main in place.mains):
             return True
-        owners = {name for name, of in self._modules.items() if module in self._used_by(of)}
+        owners = {
+            name
+            for name, modules in self._modules.items()
+            if any(module in self._used_by(one) for one in modules)
+        }
         return not owners or not place.nodes or bool(owners & place.nodes)
 
     def _used_by(self, module: str) -> set[str]:
@@ -291,8 +295,13 @@ class Relevance:
         )
 
     @cached_property
-    def _modules(self) -> dict[str, str]:
-        return {name: of.partition(":")[0] for name, of in self._classes if of}
+    def _modules(self) -> dict[str, set[str]]:
+        """The modules of the classes of a node: two if it has another class in each run."""
+        found: dict[str, set[str]] = {}
+        for name, of in self._classes:
+            if of:
+                found.setdefault(name, set()).add(of.partition(":")[0])
+        return found
 
 
 def resolved_job(trace: Trace) -> dict[str, Any]:
