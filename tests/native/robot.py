@@ -92,12 +92,19 @@ class LateListener(Listener):
         super().__init__()
 
 
+class Rated(Node):
+    """Has a Rate."""
+
+    def __init__(self) -> None:
+        super().__init__("rated")
+        self.rate = self.create_rate(10.0)
+
+
 class Server(Node):
     """Serves /ask, and an action."""
 
     def __init__(self) -> None:
         super().__init__("server")
-        self.rate = self.create_rate(10.0)
         self.create_service(Trigger, "/ask", self.on_ask)
         group = ReentrantCallbackGroup()
         ActionServer(self, Fibonacci, "/count", self.on_goal, callback_group=group)

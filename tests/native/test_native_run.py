@@ -54,6 +54,7 @@ nodes:
   - {node: robot:Talker, arguments: {offset: 100000}}
   - {node: robot:Listener, remappings: {/echo: /heard}}
   - node: robot:Server
+  - node: robot:Rated
   - node: robot:Asker
   - node: robot:Nested
 seed: 7
