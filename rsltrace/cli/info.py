@@ -9,12 +9,13 @@ from dataclasses import asdict
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import Any, TypeAlias
 
 import click
 
 from rsltrace.cli.output.text_file import write_text
-from rsltrace.terminal import say
+from rsltrace.terminal import say, terminal_width
 from rsltrace.trace.contents import TraceCounts, count_trace
 from rsltrace.trace.exports.output_file import check_not_input
 from rsltrace.trace.format import (
@@ -133,6 +134,8 @@ def _text(found: DurationStatistics | None) -> str:
 
 _Kinds: TypeAlias = type[EventKind] | type[OutputKind]
 _VALUE_MAX = 100
+_OPTIONAL = (8, 4, 6)
+"""Columns of entities that a narrow terminal does without, in this order: code, type, outputs."""
 
 
 @click.command()
@@ -179,7 +182,8 @@ def info(trace: Path, form: str, show_all: bool, check: bool, output: Path | Non
                 opened.check()
                 check_contents(opened)
         counts = count_trace(opened)
-        text = "\n".join(_as_text(opened, counts, show_all=show_all or form == "html"))
+        width = terminal_width() if output is None and form == "text" else None
+        text = "\n".join(_as_text(opened, counts, show_all or form == "html", width))
         if form == "json":
             text = json.dumps(_as_json(opened, counts), indent=2)
         elif form == "html":
@@ -222,8 +226,12 @@ def _digest(trace: Trace) -> str | None:
     return trace.digest if has_events and not is_native(trace) else None
 
 
-def _as_text(trace: Trace, counts: TraceCounts, *, show_all: bool) -> list[str]:
-    lines = table(_facts(trace, counts))
+def _as_text(trace: Trace, counts: TraceCounts, show_all: bool, width: int | None) -> list[str]:
+    """Return the summary as lines, for a terminal of ``width`` columns (None: of any length)."""
+    facts, lines = _facts(trace, counts), []
+    indent = " " * (max(len(name) for name, _ in facts) + 2)
+    for line in table(facts):
+        lines += wrap(line, width, subsequent_indent=indent) if width else [line]
     for title, mapping in (("job", trace.job), ("environment", trace.environment)):
         if mapping:
             rows = [(f"  {printable(key)}", _short(value)) for key, value in mapping.items()]
@@ -235,8 +243,8 @@ def _as_text(trace: Trace, counts: TraceCounts, *, show_all: bool) -> list[str]:
     lines += _guard_lines(trace)
     lines += _drop_lines(trace)
     lines += (f"note: {one}" for one in unseen_notes(decode_unseen(trace.result)))
-    lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts, show_all)]
-    return lines
+    lines += ["", *_node_lines(trace, counts)]
+    return [*lines, "", *_entity_lines(trace, counts, show_all, width)]
 
 
 def _short(value: str) -> str:
@@ -311,7 +319,9 @@ def _drop_lines(trace: Trace) -> list[str]:
     return ["", "full queues", *table(rows, right=frozenset((0, 1)))] if rows[1:] else []
 
 
-def _entity_lines(trace: Trace, counts: TraceCounts, show_all: bool) -> list[str]:
+def _entity_lines(
+    trace: Trace, counts: TraceCounts, show_all: bool, width: int | None
+) -> list[str]:
     entities = _entities(trace, counts)
     shown = [e for e in entities if show_all or not _idle_built_in(e, counts)]
     title = f"entities: {len(entities)}"
@@ -336,7 +346,10 @@ def _entity_lines(trace: Trace, counts: TraceCounts, show_all: bool) -> list[str
                 printable(places_text(entity_places(trace, entity), ", ")) or "-",
             )
         )
-    return [title, *table(rows, right=frozenset((0, 5, 6, 7)))]
+    lines = table(rows, right=frozenset((0, 5, 6, 7)), width=width, optional=_OPTIONAL)
+    missing = [name for name in rows[0] if name.strip() not in lines[0].split()]
+    note = f"  (no room for {', '.join(missing)}: pipe into less -S to see all)"
+    return [title, *lines, *([note] if missing else [])]
 
 
 def _as_json(trace: Trace, counts: TraceCounts) -> dict[str, Any]:

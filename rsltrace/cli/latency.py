@@ -17,7 +17,7 @@ import click
 from rsltrace.checks.latency.instances import HopMessages, HopTimes, LatencyFigures, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, Latencies, measure_latencies
 from rsltrace.errors import TraceError
-from rsltrace.terminal import say, tell, tell_notes
+from rsltrace.terminal import say, tell, tell_notes, terminal_width
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import RUN_NAME
@@ -193,7 +193,12 @@ def _hops(one: ChainLatency) -> list[str]:
         times = [_mean_and_max(getattr(parts, part)) for part in _PARTS]
         counts = [str(getattr(passed, name)) for name in _PASSED]
         rows.append((f"  {hop.topic} → {after.node or RUN_NAME}", *times, *counts))
-    return table(rows, right=_NUMBERS)
+    lines, width = table(rows, right=_NUMBERS), terminal_width()
+    if width is None or all(len(line) <= width for line in lines):
+        return lines
+    spent = [row[: 1 + len(_PARTS)] for row in rows]
+    passages = [("  messages", *_PASSED), *((row[0], *row[len(spent[0]) :]) for row in rows[1:])]
+    return [*table(spent, right=_NUMBERS), *table(passages, right=_NUMBERS)]
 
 
 def _mean_and_max(durations: Any) -> str:

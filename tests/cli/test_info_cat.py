@@ -226,6 +226,22 @@ def test_cat_leaves_out_hashes_where_a_terminal_has_no_room_for_outputs(
     assert width_of(False) is None
 
 
+def test_info_fits_into_a_terminal(
+    run: tuple[Path, Feeder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = output("info", run[0], "--all").splitlines()
+    columns = "id node kind name type events outputs Hz code".split()
+    for width, missing in ((120, []), (90, ["code"]), (80, ["type", "code"])):
+        monkeypatch.setattr("rsltrace.cli.info.terminal_width", lambda width=width: width)
+        shown = output("info", run[0], "--all").splitlines()
+        assert [line for line in shown if len(line) > width] == []
+        assert " ".join(" ".join(shown).split())[:400] == " ".join(" ".join(whole).split())[:400]
+        head = next(line.split() for line in shown if line.split()[:2] == ["id", "node"])
+        assert head == [name for name in columns if name not in missing]
+        note = f"(no room for {', '.join(missing)}: "
+        assert any(note in line for line in shown) == bool(missing)
+
+
 def width_of(is_terminal: bool) -> int | None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", SimpleNamespace(isatty=lambda: is_terminal))

@@ -11,6 +11,7 @@ import pytest
 
 import rsltrace
 from rsltrace.diff.facts.causes import Verdict
+from rsltrace.diff.facts.evidence import SettingKind
 from rsltrace.diff.report import render
 
 pytestmark = [pytest.mark.ros]
@@ -170,3 +171,46 @@ def test_view_and_rerun_open_at_the_effect(recorded: Callable[..., Path]) -> Non
     diff = rsltrace.diff(recorded(), recorded(speed="1.5"))
     found = marks.marks_of(diff, comparison.runs)
     assert (found.stamp_ns, found.row) == (100_000_000, 3)
+
+
+def test_a_factory_and_what_one_of_its_nodes_did(tmp_path: Path) -> None:
+    """All nodes of a factory come from one event, which is that of the first of them."""
+    from rsltrace.run import run
+
+    made = f"""{NODES}
+
+def make(speed):
+    lidar, follower = Lidar(), Follower()
+    lidar.declare_parameter("speed", speed)
+    follower.speed = speed
+    return [lidar, follower]
+"""
+    (tmp_path / "factory.py").write_text(made)
+    job, traces = tmp_path / "job.yaml", []
+    for speed in ("1.0", "1.5"):
+        nodes = f"[{{node: factory:make, arguments: {{speed: {speed}}}}}]"
+        job.write_text(f"nodes: {nodes}\nstop: {{duration: 1s}}\n")
+        traces.append(tmp_path / f"{speed}.mcap")
+        run(rsltrace.load_job(job), traces[-1])
+    assert rsltrace.diff(*traces).sentence == (
+        "setting nodes.0.arguments.speed 1.0 → 1.5 (job.yaml:1); first effect: /follower published "
+        "a different linear.x and 1 more field on /cmd_vel at 0.1 s (linear.x 2.0 → 3.0 and 1 more "
+        "field)"
+    )
+
+
+def test_of_a_class_of_another_module_both_modules_may_be_the_cause(tmp_path: Path) -> None:
+    """Not the one that comes first in a set of them: reports of the same runs are the same."""
+    from rsltrace.run import run
+
+    job, traces = tmp_path / "job.yaml", []
+    for module, sent in (("lidar_one", "2.0"), ("lidar_two", "3.0")):
+        (tmp_path / f"{module}.py").write_text(NODES.replace("data=2.0", f"data={sent}"))
+        nodes = ", ".join(f"{{node: {module}:Lidar, name: lidar{n}}}" for n in range(8))
+        job.write_text(f"nodes: [{nodes}]\nstop: {{duration: 1s}}\n")
+        traces.append(tmp_path / f"{module}.mcap")
+        run(rsltrace.load_job(job), traces[-1])
+    shown = rsltrace.diff(*traces).shown
+    assert shown is not None
+    code = {setting.name for setting in shown.settings if setting.kind is SettingKind.CODE}
+    assert code == {"lidar_one", "lidar_two"}

@@ -57,6 +57,12 @@ def told(a: Recorded, b: Recorded) -> dict[str, tuple[str | None, str | None]]:
     return found
 
 
+@pytest.mark.parametrize(("a", "b"), [("1", "1.0"), ("1", "true"), ("0.0", "-0.0"), (".nan", None)])
+def test_values_that_python_takes_for_the_same(tmp_path: Path, a: str, b: str | None) -> None:
+    runs = [recorded(tmp_path, JOB.replace("50.0", value)) for value in (a, b or a)]
+    assert len(told(runs[0], runs[1])) == (b is not None)
+
+
 def test_what_may_be_one_file_comes_last(tmp_path: Path) -> None:
     job = "nodes:\n  - node: m:Ekf\n    parameter_files: [{}]\n    parameters: {{rate: {}}}\n"
     jobs = tmp_path / "jobs"

@@ -216,6 +216,23 @@ def test_numbers_for_programs_are_those_of_the_table(run: Path) -> None:
     assert f"--at {chain['latency']['worst']['output_event']}" in call(run, *options).output
 
 
+def test_in_a_narrow_terminal_counts_are_below_times(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def shown(width: int | None) -> list[str]:
+        monkeypatch.setattr("rsltrace.cli.latency.terminal_width", lambda: width)
+        text = call(run, "--from", "/image", "--to", "/cmd", "--via", "controller").stdout
+        return text[text.index("  mean (max)") : text.index("  longest")].splitlines()
+
+    (head, *rows), (narrow, *others) = shown(200), shown(115)
+    assert shown(None) == [head, *rows]
+    assert all(len(line) <= 115 for line in others)
+    at = others.index(next(line for line in others if "messages" in line))
+    assert narrow.split() + others[at].split()[1:] == head.split()
+    for row, times, counts in zip(rows, others[:at], others[at + 1 :], strict=True):
+        assert times.split() + counts.split()[3:] == row.split()
+
+
 def test_two_traces_are_shown_with_their_difference(run: Path, tmp_path: Path) -> None:
     other = shutil.copy(run, tmp_path / "other.mcap")
     both = call(run, other, "--from", "/image", "--to", "/late", "--format", "json")

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from rsltrace_viewer.model.lanes import KIND_LETTERS
 from rsltrace_viewer.model.plots.series import Series
 from rsltrace_viewer.pages.charts import curves, histogram
 
@@ -22,6 +23,7 @@ from rsltrace.diff import diff_files
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.kinds import SHORT_KINDS
 from tests.pages.page import MARKUP, Page, contained, with_names
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
@@ -77,6 +79,9 @@ def test_rows_fields_and_order_are_those_of_the_traces(
                     and float(new) == pytest.approx(float(f.b), rel=1e-3)
                     for f in fields
                 ), did
+    kinds = {row[5] for row in rows}
+    for kind, letter in KIND_LETTERS.items():
+        assert (f"{letter} {kind.label}" in page.text) == (SHORT_KINDS[kind] in kinds)
     for message in diff.shown.messages:
         for field in message.fields:
             assert f"{field.a} → {field.b}" in page.text
@@ -147,7 +152,7 @@ def test_the_page_of_a_run_has_its_numbers(monkeypatch: pytest.MonkeyPatch) -> N
     page = Page(text)
     with Trace.open("b.mcap") as trace:
         assert trace.digest in page.text
-    assert ["warnings logged", "12", ""] in page.rows
+    assert ["warnings logged", "12", "32"] in page.rows
     assert "the gripper has not answered yet" in page.text
     assert ["/picked", "std_msgs/msg/UInt32"] in [row[:2] for row in page.rows]
     assert page.tags.count("marker") == 1  # the graph

@@ -75,6 +75,7 @@ def test_curves_are_the_numbers_that_stand_together() -> None:
                 "covariance": [0.0] * 36,
                 "wheels": [1, 2, 3],
                 "names": ["a"],
+                "layout": {"dim": [{"label": "x", "size": 3}], "data_offset": 0},
             }
         ]
     )

@@ -212,7 +212,9 @@ async def _browse(port: int, url: str) -> None:
 
     async with aiohttp.ClientSession() as browser:
         async with browser.get(url) as answer:
-            assert "rsltrace view" in await answer.text()
+            text = await answer.text()
+            assert "rsltrace view" in text
+            assert "focus()" in text, "keys need no click before"
             policy = answer.headers["Content-Security-Policy"]
             assert "default-src http://127.0.0.1" in policy  # no fonts from elsewhere
         for stranger in ({"Origin": "http://example.org"}, {"Host": "example.org"}):

@@ -243,7 +243,7 @@ def _changes(path_a: KeyPath, path_b: KeyPath, a: Any, b: Any) -> Iterator[_Chan
                 yield _Change(inner_a, inner_b, of_a, of_b)
     elif isinstance(a, list) and isinstance(b, list) and _holds_parts(a, b):
         yield from _changed_entries(path_a, path_b, a, b)
-    elif a != b or type(a) is not type(b):
+    elif repr(a) != repr(b):  # 1 is not true, nor 0.0 -0.0; a NaN is no other one
         yield _Change(path_a, path_b, (a,), (b,))
 
 

@@ -431,9 +431,11 @@ class Propagation:
             self._taint(owner, origin)
         if takes_longer:
             self._busy = self._busy or origin
-        if rows.kind[place] == CONSTRUCT:  # a program and the node that it makes are one
+        if rows.kind[place] == CONSTRUCT:  # a program and the nodes that it makes are one
             for kind, number, _, _ in rows.outputs(rows.first + place):
-                if kind == _ENTITY and keys[number].kind in OF_THEIR_OWN:
+                if kind == _ENTITY and (
+                    nodes[number] == number or keys[number].kind in OF_THEIR_OWN
+                ):
                     self._taint(number, origin)
         if moved_ns:  # what both runs have was sent at another time
             for kind, number, _, _ in beyond(rows.outputs(rows.first + place), outputs):

@@ -243,7 +243,7 @@ class Relevance:
 
     def is_of_a_class(self, node: str) -> bool:
         """Whether a node has a state to record: one in a process of its own has no class here."""
-        return node in self._modules
+        return any(name == node and of for name, of in self._classes)
 
     @cached_property
     def guard_is_off(self) -> bool:
@@ -309,10 +309,6 @@ class Relevance:
             for entity in trace.entities.values()
             if entity.kind is EntityKind.NODE
         )
-
-    @cached_property
-    def _modules(self) -> dict[str, str]:
-        return {name: of.partition(":")[0] for name, of in self._classes if of}
 
 
 def resolved_job(trace: Trace) -> dict[str, Any]:

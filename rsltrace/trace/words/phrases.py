@@ -18,22 +18,32 @@ if TYPE_CHECKING:
 _COLUMN_MAX = 60
 
 
-def table(rows: Iterable[Sequence[str]], *, right: frozenset[int] = frozenset()) -> list[str]:
+def table(
+    rows: Iterable[Sequence[str]],
+    *,
+    right: frozenset[int] = frozenset(),
+    width: int | None = None,
+    optional: Sequence[int] = (),
+) -> list[str]:
     """Return ``rows`` as lines with aligned columns, two spaces between them.
 
     ``right`` has the columns that are aligned to the right. No line ends in spaces. A cell that is
-    very long pushes the rest of its line to the right, not that of all lines.
+    very long pushes the rest of its line to the right, not that of all lines. If lines are longer
+    than ``width``, the ``optional`` columns are left out, one after the other.
     """
     cells = [list(row) for row in rows]
-    widths = [
-        max((len(cell) for cell in column if len(cell) <= _COLUMN_MAX), default=0)
-        for column in zip(*cells, strict=True)
-    ]
+    widths = {
+        place: max((len(cell) for cell in column if len(cell) <= _COLUMN_MAX), default=0)
+        for place, column in enumerate(zip(*cells, strict=True))
+    }
+    for place in optional:
+        if width is not None and sum(widths.values()) + 2 * (len(widths) - 1) > width:
+            del widths[place]
     lines = []
     for row in cells:
         padded = [
-            cell.rjust(width) if place in right else cell.ljust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+            row[place].rjust(size) if place in right else row[place].ljust(size)
+            for place, size in widths.items()
         ]
         lines.append("  ".join(padded).rstrip())
     return lines

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 from rsltrace.errors import TraceError
 from rsltrace.fast_dataclass import dataclass
@@ -78,6 +79,14 @@ def event_of(run: Run, line: LogLine) -> int | None:
             if output.kind is OutputKind.LOG and output.sequence == line.sequence:
                 return index
         index += 1
+    return None
+
+
+def first_event(run: Run, logs: Logs, least: int, below: int) -> int | None:
+    """Return the event of the first record of a level in ``[least, below)``, if there is one."""
+    found = next((line for line in logs.lines if least <= line.record.level < below), None)
+    with suppress(TraceError):
+        return None if found is None else event_of(run, found)
     return None
 
 

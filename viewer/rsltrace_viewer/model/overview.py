@@ -22,7 +22,7 @@ from rsltrace.trace.model.event import (
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.logs import LEVEL_WARN, silent_topics
-from rsltrace_viewer.model.logs import Logs
+from rsltrace_viewer.model.logs import Logs, first_event
 from rsltrace_viewer.model.run import Run, Segment
 
 _LEVEL_ERROR = 40
@@ -271,8 +271,10 @@ def troubles_of(run: Run, overview: Overview, logs: Logs | None) -> list[Trouble
     if logs is not None:
         errors = logs.count(_LEVEL_ERROR)
         warnings = logs.count(LEVEL_WARN) - errors
-        found.append(Trouble("errors logged", errors, "g", True, filter="level:error"))
-        found.append(Trouble("warnings logged", warnings, "w", filter="level:warn"))
+        first = first_event(run, logs, _LEVEL_ERROR, _LEVEL_ERROR * 10)
+        found.append(Trouble("errors logged", errors, "g", True, first, "level:error"))
+        first = first_event(run, logs, LEVEL_WARN, _LEVEL_ERROR)
+        found.append(Trouble("warnings logged", warnings, "w", first=first, filter="level:warn"))
     count = sum(len(one) for one in findings.values())
     first = min(findings, default=None)
     found.append(Trouble("findings of the guard", count, "u", first=first))

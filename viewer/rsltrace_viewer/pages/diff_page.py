@@ -33,7 +33,7 @@ from rsltrace_viewer.model.plots.series import PlotSource, difference, most_tell
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.source import CallbackCode, source_of
 from rsltrace_viewer.pages.charts import curves
-from rsltrace_viewer.pages.order import OrderRow, lanes_svg
+from rsltrace_viewer.pages.order import OrderRow, lanes_svg, legend
 from rsltrace_viewer.pages.page import render_page
 from rsltrace_viewer.session import Session
 
@@ -54,6 +54,7 @@ class Evidence:
     lanes: Markup | None = None
     sources: Sequence[CallbackCode] = ()
     plots: Sequence[tuple[str, str, Markup]] = ()
+    legend: str = ""
 
 
 def diff_page(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
@@ -166,7 +167,8 @@ def evidence_of(diff: Diff) -> Evidence:
         return Evidence()
     with closing(Run.open(diff.a.path)) as a, closing(Run.open(diff.b.path)) as b:
         rows = [*order_rows(Session(a, b), diff)]
-        return Evidence(rows, lanes_svg(rows), [*_sources(a, b, diff)], [*_plots(a, b, diff)])
+        sources, plots = [*_sources(a, b, diff)], [*_plots(a, b, diff)]
+        return Evidence(rows, lanes_svg(rows), sources, plots, legend(rows))
 
 
 def order_rows(session: Session, diff: Diff) -> Iterator[OrderRow]:

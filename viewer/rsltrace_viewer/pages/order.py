@@ -19,7 +19,7 @@ _COLUMN, _LINE, _LABEL, _LEFT, _TOP = 22, 20, 16, 18, 16
 _NODES_MAX = 12
 _NAME_MAX = 60
 _TIMES_EVERY = 5
-_LETTERS = {SHORT_KINDS[kind]: letter for kind, letter in KIND_LETTERS.items()}
+_LETTERS = {SHORT_KINDS[kind]: (letter, kind.label) for kind, letter in KIND_LETTERS.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +49,12 @@ class OrderRow:
         return (
             f"{self.sign.value} {' / '.join(sides)}  {event.time} s  {shortened(what, _NAME_MAX)}"
         )
+
+
+def legend(rows: Sequence[OrderRow]) -> str:
+    """Return what the letters in the lanes mean."""
+    kinds = {row.event.kind for row in rows}
+    return ", ".join(" ".join(words) for kind, words in _LETTERS.items() if kind in kinds)
 
 
 def lanes_svg(rows: Sequence[OrderRow]) -> Markup:
@@ -88,7 +94,7 @@ def _cell(svg: Element, x: int, y: int, row: OrderRow) -> None:
     SubElement(group, "title").text = printable(row.title)
     size = {"width": f"{_COLUMN - 3}", "height": f"{_LINE - 3}", "rx": "3"}
     SubElement(group, "rect", {"x": f"{x + 1}", "y": f"{y}", **size})
-    _text(group, x + _COLUMN // 2, y + 12, _LETTERS.get(row.event.kind, "?"), "", "middle")
+    _text(group, x + _COLUMN // 2, y + 12, _LETTERS.get(row.event.kind, "?")[0], "", "middle")
 
 
 def _text(

@@ -2,8 +2,8 @@
 
 textual-serve starts the viewer once per page and carries its screen over a websocket. What it lacks
 is added here: any page in the same browser, and any user of the machine, could connect to the port;
-its own page fetches a font from somebody's server; each page starts one more viewer, of the size
-that it asks for; and what pages send is written to the terminal.
+its own page fetches a font from somebody's server and takes no key before a click; each page starts
+one more viewer, of the size that it asks for; and what pages send is written to the terminal.
 """
 
 from __future__ import annotations
@@ -28,6 +28,13 @@ _PAGES_MAX = 12
 _SIZE = (("width", 80), ("height", 24))
 _SIDE_MAX = 1000
 """Columns or rows of a page; Textual keeps several objects for each cell."""
+_TAKE_KEYS = """<script>
+new MutationObserver((_, watch) => {
+  if (!document.body.classList.contains("-first-byte")) return;
+  watch.disconnect();
+  document.querySelector("#terminal textarea")?.focus();
+}).observe(document.documentElement, {subtree: true, attributeFilter: ["class"]});
+</script></head>"""
 _NO_MESSAGE = (ValueError, TypeError, KeyError, OverflowError, RecursionError)
 
 
@@ -64,6 +71,13 @@ class LocalServer(Server):  # type: ignore[misc]  # textual-serve has no types
             logging.getLogger(name).propagate = False
         for name in ("aiohttp.access", "aiohttp.server", "asyncio"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+    async def handle_index(self, request: web.Request) -> web.Response:
+        """Return the page, which takes keys as soon as it shows the viewer."""
+        page = await super().handle_index(request)
+        assert isinstance(page, web.Response)
+        page.text = str(page.text).replace("</head>", _TAKE_KEYS)
+        return page
 
     async def handle_websocket(self, request: web.Request) -> web.WebSocketResponse:
         """Start a viewer for a page, if there are not too many of them.

@@ -25,13 +25,14 @@ from rsltrace_viewer.rerun_export.messages.shapes import items, numbers
 # Numeric fields of messages as curves: what makes any topic plottable, whatever its type.
 #
 # The numbers that stand together in a message (x, y and z of a position) are one set of curves, at
-# ``TOPIC/pose.pose.position``. Times and large arrays such as covariances are no curves.
+# ``TOPIC/pose.pose.position``. Times, large arrays such as covariances and the layout of arrays are
+# no curves.
 
 _ITEMS_MAX = 16
 _CURVES_MAX = 32
 """More curves than this are no plot that anybody reads; the data is there all the same."""
-_TIME_FIELDS = ({"sec", "nanosec"}, {"seconds", "nanoseconds"})
-"""What ROS puts into a message that has no fields."""
+_NO_CURVES = ({"sec", "nanosec"}, {"seconds", "nanoseconds"}, {"data_offset"})
+"""The numbers of a time, a duration, and a ``MultiArrayLayout``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ def _curves(structs: pa.StructArray, path: str) -> Iterator[Curves]:
             names.append(field.name)
         else:
             inner.append((field.name, structs.field(place)))
-    if names and set(names) not in _TIME_FIELDS:
+    if names and set(names) not in _NO_CURVES:
         shown = names[:_CURVES_MAX]
         values = np.stack([numbers(structs.field(name)) for name in shown], axis=1)
         counts = np.full(len(structs), len(shown), dtype=np.int64)

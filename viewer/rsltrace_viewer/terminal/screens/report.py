@@ -22,6 +22,9 @@ _STYLES = {
     Style.COMMAND: "bold",
 }
 
+_LINES_MAX = 200
+"""More than a command prints: the screen scrolls, and what is left out is nowhere else."""
+
 
 class ReportScreen(TextScreen):
     def __init__(self, diff: Diff | BagDiff) -> None:
@@ -29,7 +32,8 @@ class ReportScreen(TextScreen):
         self._diff = diff
 
     def text(self) -> Content:
-        lines = report_lines(_without_view(self._diff), DiffOptions(), width=self.room)
+        diff = _without_view(self._diff)
+        lines = report_lines(diff, DiffOptions(), width=self.room, height=_LINES_MAX)
         return Content("\n").join(
             Content.assemble(*((piece, _STYLES.get(style, "")) for piece, style in line))
             for line in lines
