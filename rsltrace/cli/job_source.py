@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.completion import complete_files
-from rsltrace.cli.options import set_option
+from rsltrace.cli.options import complete_files, set_option
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.mappings import split_ros_arguments
 
