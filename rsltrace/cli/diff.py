@@ -231,7 +231,7 @@ def _diff(
             errors[f"{other} agrees with {golden}"] = str(error)
     if done or form in _CI_FORMATS:
         print_diffs(done, form, options, output, errors)
-    from rsltrace.diff.exit_codes import exit_code_of_several
+    from rsltrace.diff.options import exit_code_of_several
 
     return EXIT_USAGE if errors else exit_code_of_several(one.exit_code for one in done)
 

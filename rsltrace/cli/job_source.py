@@ -42,7 +42,7 @@ class RosArgsCommand(click.Command):
             take(name) for name in ("words", "launch", "bag", "overrides")
         )
         if launch is not None:
-            from rsltrace.adapters.launch.file_lookup import launch_file
+            from rsltrace.adapters.launch.specs import launch_file
 
             launch, words = launch_file(launch, words)
         entries = [("--bag", ("bags", {"path": str(path)})) for path in bags]

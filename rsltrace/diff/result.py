@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.diff.facts.bags import BagComparison, NativeComparison
 from rsltrace.diff.facts.causes import CallbackAbsence, Judgement, PossibleCause, Verdict
 from rsltrace.diff.facts.evidence import (
@@ -19,6 +18,7 @@ from rsltrace.diff.facts.evidence import (
     Setting,
 )
 from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
+from rsltrace.diff.options import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.fast_dataclass import dataclass
 
 if TYPE_CHECKING:

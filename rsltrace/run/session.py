@@ -496,7 +496,7 @@ class RunSession:
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
         """Return the parts of the job without effect so far; ``lasted``: the run is over."""
-        from rsltrace.adapters.rclpy.parameters import parameters_of
+        from rsltrace.adapters.rclpy.handles.node import parameters_of
 
         domain = self.world.domain
         lasted_ns = self.loop.now_ns - self.start_ns if lasted else None

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace import Job, Trace
-from rsltrace.adapters.launch.file_lookup import launch_file
+from rsltrace.adapters.launch.specs import launch_file
 from rsltrace.errors import JobError
 from rsltrace.job import LaunchSpec, load_job
 from rsltrace.run import run

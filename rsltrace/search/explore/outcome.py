@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rsltrace.checks.evaluate import VIOLATED, CheckResult, evaluate_checks
-from rsltrace.checks.functions import load_function
+from rsltrace.checks.evaluate import VIOLATED, CheckResult, evaluate_checks, load_function
 from rsltrace.checks.metrics import evaluate_metrics
 from rsltrace.errors import (
     CheckError,
