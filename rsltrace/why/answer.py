@@ -39,8 +39,7 @@ from rsltrace.why.graph import (
     NotReceived,
 )
 from rsltrace.why.history import RunHistory
-from rsltrace.why.question import SENDERS, WITH_CALLBACK, Question, filter_of
-from rsltrace.why.reason import Reason
+from rsltrace.why.question import SENDERS, WITH_CALLBACK, Question, Reason, filter_of
 
 # Finds the callback that is meant, or why there is none.
 

@@ -14,8 +14,7 @@ from rsltrace.trace.model.finding import decode_drops, decode_waits
 from rsltrace.trace.model.operation import TIMER_CANCEL, pack_operation
 from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.why.history import Message
-from rsltrace.why.question import Question
-from rsltrace.why.reason import Reason
+from rsltrace.why.question import Question, Reason
 
 _AT_LINE = re.compile(r" at (\S+:\d+) in ")
 _HINT = ", which may be one of the events"

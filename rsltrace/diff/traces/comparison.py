@@ -43,7 +43,7 @@ from rsltrace.diff.facts.remarks import (
     ZeroDelaysBefore,
 )
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result import BagDiff, Diff, Divergence, EntityCount
+from rsltrace.diff.result import BagDiff, Diff, Divergence, EntityCount, interruptions, side
 from rsltrace.diff.traces.ended_runs import (
     failure,
     failures,
@@ -51,7 +51,6 @@ from rsltrace.diff.traces.ended_runs import (
     judge_end,
     who_ended,
 )
-from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.errors import TraceError, near_or_all
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
