@@ -10,13 +10,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.diff.facts.bags import BagComparison, NativeComparison
 from rsltrace.diff.facts.causes import CallbackAbsence, Judgement, PossibleCause, Verdict
-from rsltrace.diff.facts.evidence import (
-    AffectedTopic,
-    CallDifference,
-    CauseStep,
-    EventRow,
-    Setting,
-)
+from rsltrace.diff.facts.evidence import AffectedTopic, CallDifference, CauseStep, EventRow, Setting
 from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats, TruncatedRecording
 from rsltrace.diff.options import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.fast_dataclass import dataclass

@@ -24,13 +24,7 @@ from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
 from rsltrace.run.process import RunCallbacks
 from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
-from rsltrace.run.stop_rules import (
-    StopInputs,
-    conditions_of,
-    end_ns_of,
-    stop_rules,
-    watch_messages,
-)
+from rsltrace.run.stop_rules import StopInputs, conditions_of, end_ns_of, stop_rules, watch_messages
 from rsltrace.simulation.loop.policy import PriorityRule
 from rsltrace.simulation.loop.stop import Progress, Stop
 from rsltrace.simulation.middleware.events.failure import as_printed, exception_text

@@ -107,9 +107,7 @@ if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.state_samples import StateSamples
     from rsltrace.simulation.chance.channel import NetworkPlan
-    from rsltrace.simulation.middleware.events.recorded_order_observer import (
-        RecordedOrderObserver,
-    )
+    from rsltrace.simulation.middleware.events.recorded_order_observer import RecordedOrderObserver
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000

@@ -16,12 +16,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 from rsltrace.errors import TraceError
 from rsltrace.job import load_job
 from rsltrace.run import run
-from rsltrace.simulation.middleware.qos.policies import (
-    DEFAULT_QOS,
-    Liveliness,
-    Qos,
-    Reliability,
-)
+from rsltrace.simulation.middleware.qos.policies import DEFAULT_QOS, Liveliness, Qos, Reliability
 from rsltrace.trace.reader import Trace
 from rsltrace.why.answer import why
 

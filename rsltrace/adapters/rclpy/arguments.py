@@ -11,11 +11,7 @@ from enum import IntEnum
 from typing import Any
 
 from rsltrace.adapters.rclpy.names import expand
-from rsltrace.adapters.rclpy.parameter_overrides import (
-    NO_TEXT,
-    ParameterFault,
-    ParameterOverrides,
-)
+from rsltrace.adapters.rclpy.parameter_overrides import NO_TEXT, ParameterFault, ParameterOverrides
 from rsltrace.fast_dataclass import dataclass
 
 

@@ -20,10 +20,7 @@ from rsltrace.adapters.rclpy.concurrency.endless_waits import note_waits
 from rsltrace.adapters.rclpy.concurrency.entry_starts import ConstructionEvent, EntryStarts
 from rsltrace.adapters.rclpy.concurrency.line_switches import switches_at_lines
 from rsltrace.adapters.rclpy.concurrency.mains import begin_program, end_programs, own_exit_handlers
-from rsltrace.adapters.rclpy.concurrency.process_exit import (
-    own_process_ends,
-    own_signal_handlers,
-)
+from rsltrace.adapters.rclpy.concurrency.process_exit import own_process_ends, own_signal_handlers
 from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.concurrency.threads import cooperative_threads

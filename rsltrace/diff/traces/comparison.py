@@ -24,10 +24,7 @@ from rsltrace.diff.alignment.rows import SHUTDOWN, ComparedTrace, load_rows
 from rsltrace.diff.causes.effects import EffectSearch
 from rsltrace.diff.causes.explain import Explainer
 from rsltrace.diff.causes.job_settings import job_settings
-from rsltrace.diff.causes.propagation import (
-    FoundDivergence,
-    Propagation,
-)
+from rsltrace.diff.causes.propagation import FoundDivergence, Propagation
 from rsltrace.diff.causes.relevance import entity_settings, environment_settings
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.evidence import Setting
