@@ -136,9 +136,7 @@ def test_a_launch_file_in_a_job(rsltrace: Command, folder: Path) -> None:
     assert also.stdout == done.stdout
 
 
-def test_words_that_do_not_fit_together(
-    rsltrace: Command,
-) -> None:
+def test_words_that_do_not_fit_together(rsltrace: Command) -> None:
     for arguments, message in [
         ((), "Missing argument 'JOB' (or --launch FILE, or -- PROGRAM)"),
         (("--set", "seed=1"), "Missing argument 'JOB' (or --launch FILE, or -- PROGRAM)"),

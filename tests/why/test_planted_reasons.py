@@ -167,9 +167,7 @@ PLANTED = [
         at="500ms",
         says="began at 0.45 s and had not ended at 0.5 s",
     ),
-    Planted(
-        *("waits", "crashes", "numbers", "node_ended", "/crashes ended at 0.35 s", "Worker"),
-    ),
+    Planted(*("waits", "crashes", "numbers", "node_ended", "/crashes ended at 0.35 s", "Worker")),
     Planted("waits", "hangs", "numbers", "busy", "node /hangs hung from 0.35 s", "Worker"),
     Planted(
         *("constructor", "broken", "numbers", "not_constructed", "its constructor raised"),

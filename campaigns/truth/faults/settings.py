@@ -140,11 +140,7 @@ def default_delay(rng: random.Random) -> Planted:
     a = random_world(rng)
     a.job["delay"] = {"default": "1ms"}
     b = changed(a, "delay", {"default": "3ms"})
-    return Planted(
-        a,
-        b,
-        _truth(("draw", "timing"), first=(r"1 ms.* 3 ms",), says=(r"delay",)),
-    )
+    return Planted(a, b, _truth(("draw", "timing"), first=(r"1 ms.* 3 ms",), says=(r"delay",)))
 
 
 @fault("execution time")
@@ -167,11 +163,7 @@ def outage(rng: random.Random) -> Planted:
     outages = [{"node": node.full_name, "from": "100ms", "to": "200ms"}]
     a.job["delay"] = {"default": 0}
     b = changed(a, "delay", {"default": 0, "outages": outages})
-    return Planted(
-        a,
-        b,
-        _truth(("draw", "timing", "missing"), says=(r"outage",)),
-    )
+    return Planted(a, b, _truth(("draw", "timing", "missing"), says=(r"outage",)))
 
 
 @fault("loss")
@@ -240,11 +232,7 @@ def node_order(rng: random.Random) -> Planted:
     a, _ = _two_sources(rng)
     b = a.copy()
     b.job["nodes"].reverse()
-    return Planted(
-        a,
-        b,
-        _truth(("graph", "schedule"), says=(r"order",), independent=None),
-    )
+    return Planted(a, b, _truth(("graph", "schedule"), says=(r"order",), independent=None))
 
 
 @fault("executors")
