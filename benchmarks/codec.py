@@ -27,14 +27,7 @@ from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from sensor_msgs.msg import (
-    Imu,
-    JointState,
-    LaserScan,
-    NavSatFix,
-    PointCloud2,
-    PointField,
-)
+from sensor_msgs.msg import Imu, JointState, LaserScan, NavSatFix, PointCloud2, PointField
 from std_msgs.msg import Header, String, UInt64
 from std_srvs.srv import Trigger
 

@@ -152,14 +152,7 @@ GRAPHS = {
         ),
         Graph("graph8", "graph of 8 nodes", (), _eight_nodes, _groups_job(1)),
         Graph("graph200", "graph of 200 nodes", (), None, _groups_job(25), longer=4),
-        Graph(
-            "actions",
-            "goals, one after the other",
-            (),
-            _action_nodes,
-            _action_job,
-            longer=0.25,
-        ),
+        Graph("actions", "goals, one after the other", (), _action_nodes, _action_job, longer=0.25),
         Graph("mains", "ping-pong of two mains that spin", (), None, _mains_job, longer=0.5),
         Graph("calls", "blocking calls of a main", (), None, _calls_job, longer=0.5),
     )

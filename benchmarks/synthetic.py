@@ -15,12 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from rsltrace.trace.chain import hash64
-from rsltrace.trace.dtypes import (
-    EVENT_DTYPE,
-    EVENT_REST_DTYPE,
-    OUTPUT_CONTENT_DTYPE,
-    OUTPUT_DTYPE,
-)
+from rsltrace.trace.dtypes import EVENT_DTYPE, EVENT_REST_DTYPE, OUTPUT_CONTENT_DTYPE, OUTPUT_DTYPE
 from rsltrace.trace.format import CDR_HEADER, OUTPUT_HASHED
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind

@@ -303,7 +303,7 @@ RUNS_CODE = {
     # Python launch files are programs; they are read in a process of their own.
     "rsltrace/adapters/launch/python_file.py": "import_module",  # modules of launch
     "rsltrace/adapters/launch/api/substitutions.py": "eval import_module",  # PythonExpression
-    "rsltrace/adapters/launch/api/description_sources.py": "exec_module",  # a Python launch file
+    "rsltrace/adapters/launch/api/actions.py": "exec_module",  # a Python launch file
     "rsltrace/adapters/launch/expand.py": "pickle",  # the answer of that process
     # Between processes of one command, on a socket or pipe that nobody else has.
     "rsltrace/native/processes/wire.py": "pickle",  # of user code: plain values only

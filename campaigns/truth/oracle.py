@@ -161,10 +161,7 @@ def _symmetric(found: Diff, mirrored: Diff) -> list[Complaint]:
             if what == "sentence":
                 told = (found.sentence, mirrored.sentence)
             if what == "cause":
-                told = (
-                    found.divergences[0].root_sentence,
-                    mirrored.divergences[0].root_sentence,
-                )
+                told = (found.divergences[0].root_sentence, mirrored.divergences[0].root_sentence)
             wrong.append(Complaint("symmetric", f"{what}: {told[0]} and {told[1]}"))
     return wrong
 

@@ -24,7 +24,7 @@ from rsltrace.trace.words.phrases import table
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
-    from rsltrace.native.timing.analysis import ChainResult, TimingAnalysis, WorstResponse
+    from rsltrace.native.timing.bounds import ChainResult, TimingAnalysis, WorstResponse
     from rsltrace.native.timing.chains import ObservedChains
     from rsltrace.native.timing.system import Supply
 
@@ -98,7 +98,7 @@ def analyze(
       rsltrace analyze job.yaml native.mcap --times max --plot bounds.png
     """
     from rsltrace.job import load_job
-    from rsltrace.native.timing import analysis as timing
+    from rsltrace.native.timing import bounds as timing
     from rsltrace.native.timing.model import ProcessorModel, check_job
     from rsltrace.run.inputs import expand_launch_files
 

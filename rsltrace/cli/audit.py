@@ -38,12 +38,7 @@ _FORMATS = ("text", "json", "github")
     is_flag=True,
     help="Show only what the guard does not make deterministic.",
 )
-def audit(
-    given: JobArguments,
-    form: str,
-    as_json: bool,
-    unguarded: bool,
-) -> int:
+def audit(given: JobArguments, form: str, as_json: bool, unguarded: bool) -> int:
     """Scan the sources of JOB's nodes, a .py file or a folder for nondeterminism.
 
     \b

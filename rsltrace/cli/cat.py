@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError, near_or_all
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.terminal import line_writer, tell_notes, terminal_width
+from rsltrace.terminal import line_writer, say, tell, tell_notes, terminal_width
 from rsltrace.trace.format import TOPIC_DETAILS
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import (
@@ -36,11 +36,12 @@ from rsltrace.trace.words.code import code_place, code_places, output_places, pl
 from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.kinds import flag_names
 from rsltrace.trace.words.logs import log_record
-from rsltrace.trace.words.phrases import notes_on
+from rsltrace.trace.words.phrases import notes_on, path_word
 
 if TYPE_CHECKING:
     from rsltrace.conditions.trace_events import TraceCondition
     from rsltrace.job.values.times import TimeInRun
+
 
 _WITH_MESSAGE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG)
 _WITH_PLACE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.LOG)
@@ -439,3 +440,44 @@ def _touching(
     senders = outputs["event"][np.isin(outputs["entity"], entities)]
     touching[(senders - events["index"][0]).astype(np.intp)] = True
     return touching
+
+
+@click.command()
+@click.argument("trace", type=click.Path(path_type=Path))
+@click.argument("node")
+@click.argument("what", metavar="TOPIC|CALLBACK", default="")
+@click.option(
+    "--at",
+    type=RunTimeParam(),
+    metavar="T",
+    help="Ask about time T of the run: seconds, or with a unit (90s, 5ms). @T is a simulated time.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) -> int:
+    """Say why a callback of NODE did not come, or came late.
+
+    TOPIC is that of a subscription, or the name of a service or client; CALLBACK is the function
+    of one of these or of a timer (Planner.on_scan, or on_scan), or the number of an entity.
+    Without either, those of the node are listed.
+
+    Without --at, the whole run is looked at: the first message that the callback did not get, else
+    the one it got latest. The line of code is that of what is to blame.
+
+    Exit status: 0 if the callback ran as expected, 1 if there is a reason why it did not, 2 if
+    there is no such node, topic or callback.
+    """
+    from rsltrace.why.answer import AsExpected, answer_lines
+    from rsltrace.why.answer import as_json as reason_json
+    from rsltrace.why.answer import why as find_reason
+
+    with Trace.open(trace) as opened:
+        tell_notes(notes_on(opened))
+        at_ns = None if at is None else at.stamp_ns(opened.start_ns, opened.end_ns)
+        reason = find_reason(opened, node, what, at_ns)
+        if as_json:
+            say(json.dumps(reason_json(reason), indent=2))
+        else:
+            say("\n".join(answer_lines(reason)))
+    if reason.event is not None and not as_json:
+        tell(f"next: rsltrace view {path_word(str(trace))} --at {reason.event}")
+    return int(not isinstance(reason, AsExpected))

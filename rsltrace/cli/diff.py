@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.completion import complete_files
+from rsltrace.cli.options import complete_files
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceError, TraceFormatError
@@ -231,7 +231,7 @@ def _diff(
             errors[f"{other} agrees with {golden}"] = str(error)
     if done or form in _CI_FORMATS:
         print_diffs(done, form, options, output, errors)
-    from rsltrace.diff.exit_codes import exit_code_of_several
+    from rsltrace.diff.options import exit_code_of_several
 
     return EXIT_USAGE if errors else exit_code_of_several(one.exit_code for one in done)
 

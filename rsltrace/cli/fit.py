@@ -131,7 +131,7 @@ def fit(
         if output is not None:
             _write(output, found, job, path, first, settings)
         if plot is not None:
-            from rsltrace.native.fit.picture import picture_of
+            from rsltrace.native.fit.fitted_job import picture_of
 
             save_picture(picture_of(found, first.name), plot)
         checked = None

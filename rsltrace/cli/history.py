@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from rsltrace.cli.completion import complete_files
+from rsltrace.cli.options import complete_files
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import TraceError
 from rsltrace.terminal import say, tell

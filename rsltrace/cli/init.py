@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.output.text_file import write_text
-from rsltrace.cli.schema import schema_text
 from rsltrace.errors import BagError, OutputError
-from rsltrace.terminal import tell
+from rsltrace.terminal import say, tell
 from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
 if TYPE_CHECKING:
     from rsltrace.job.reading.node_source import NodeSource
+
 
 _HEAD = """\
 # yaml-language-server: $schema=job.schema.json
@@ -205,3 +206,22 @@ def _bag_text(source: str, folder: Path) -> str:
         raise BagError(
             f"{error} (a node is named as module:Class or path/to/file.py:Class)"
         ) from None
+
+
+@click.command()
+def schema() -> None:
+    """Print the JSON Schema (draft 2020-12) of job files.
+
+    \b
+    For completion and checks in VS Code (with Red Hat's YAML extension) and other editors, run
+      rsltrace schema > job.schema.json
+    and put this line at the top of the job file:
+      # yaml-language-server: $schema=job.schema.json
+    """
+    say(schema_text())
+
+
+def schema_text() -> str:
+    from rsltrace.job.documents.schema import job_schema
+
+    return json.dumps(job_schema(), indent=2)

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.completion import complete_files
-from rsltrace.cli.options import set_option
+from rsltrace.cli.options import complete_files, set_option
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.mappings import split_ros_arguments
 
@@ -43,7 +42,7 @@ class RosArgsCommand(click.Command):
             take(name) for name in ("words", "launch", "bag", "overrides")
         )
         if launch is not None:
-            from rsltrace.adapters.launch.file_lookup import launch_file
+            from rsltrace.adapters.launch.specs import launch_file
 
             launch, words = launch_file(launch, words)
         entries = [("--bag", ("bags", {"path": str(path)})) for path in bags]

@@ -45,7 +45,16 @@ _COMMANDS = {
     "install-ros": "Install rclpy where ROS has no wheels for the machine.",
     "mcp": "Serve AI agents over the Model Context Protocol.",
 }
-"""Each is the function of its name in the module of its name, beside this one."""
+"""Each is the function of its name in the module of its name, beside this one, or in that of a
+command like it."""
+
+_IN_MODULE_OF = {
+    "why": "cat",
+    "flaky": "explore",
+    "rerun": "export",
+    "schema": "init",
+    "completion": "options",
+}
 
 
 class LazyGroup(click.Group):
@@ -58,8 +67,9 @@ class LazyGroup(click.Group):
         """Import a command, or return None if there is none of that name."""
         if cmd_name not in _COMMANDS:
             return None
-        module = cmd_name.replace("-", "_")
-        command = getattr(importlib.import_module(f"rsltrace.cli.{module}"), module)
+        name = cmd_name.replace("-", "_")
+        module = importlib.import_module(f"rsltrace.cli.{_IN_MODULE_OF.get(name, name)}")
+        command = getattr(module, name)
         assert isinstance(command, click.Command)
         return command
 

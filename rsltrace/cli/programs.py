@@ -11,8 +11,7 @@ from typing import Any
 
 import click
 
-from rsltrace.adapters.launch.file_lookup import launch_file
-from rsltrace.adapters.launch.specs import RosWords
+from rsltrace.adapters.launch.specs import RosWords, launch_file
 from rsltrace.job.values.mappings import split_ros_arguments
 
 Entry = tuple[str, dict[str, Any]]

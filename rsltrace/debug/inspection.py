@@ -14,12 +14,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.adapters.processes.process import Process
-from rsltrace.conditions.evaluation import (
-    TextPositions,
-    UnsupportedExpression,
-    field_names,
-    parsed,
-)
+from rsltrace.conditions.evaluation import TextPositions, UnsupportedExpression, field_names, parsed
 from rsltrace.conditions.expressions import (
     check_names,
     free_names,

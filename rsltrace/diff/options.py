@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
@@ -95,3 +96,17 @@ def _on_topic(glob: str, topic: str) -> str | None:
     """Return the field glob of ``[TOPICS:]FIELDS``, or None if it does not hold for ``topic``."""
     topics, colon, fields = glob.rpartition(":")
     return fields if not colon or fnmatchcase(topic, topics) else None
+
+
+# The exit status of a comparison: 0 identical, 1 diverged or cut, 3 equal within tolerance.
+
+EXIT_DIVERGED = 1
+
+EXIT_WITHIN_TOLERANCE = 3
+"""Neither identical (0) nor diverged (1), and not what others use for trouble (2)."""
+
+
+def exit_code_of_several(codes: Iterable[int]) -> int:
+    """Return the worst: diverged, then within tolerance, then identical."""
+    found = set(codes)
+    return next((code for code in (EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE) if code in found), 0)

@@ -8,18 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.diff.facts.bags import BagComparison, NativeComparison
 from rsltrace.diff.facts.causes import CallbackAbsence, Judgement, PossibleCause, Verdict
-from rsltrace.diff.facts.evidence import (
-    AffectedTopic,
-    CallDifference,
-    CauseStep,
-    EventRow,
-    Setting,
-)
-from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
+from rsltrace.diff.facts.evidence import AffectedTopic, CallDifference, CauseStep, EventRow, Setting
+from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats, TruncatedRecording
+from rsltrace.diff.options import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.fast_dataclass import dataclass
+from rsltrace.trace.native import is_native
+from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
     from rsltrace.trace.words.entities import EntityKey
@@ -256,3 +252,33 @@ class Reproduction(RepeatedRun):
     def exit_code(self) -> int:
         """0 if one of the runs was repeated, 1 if not."""
         return 0 if self.repeats in (Repeats.A, Repeats.B) else 1
+
+
+# What there is to know of each of the two runs as a whole.
+
+
+def stop_reason(trace: Trace) -> str:
+    if not trace.complete:
+        return "interrupted"
+    return trace.result.get("stop_reason") or "no reason given"
+
+
+def side(trace: Trace) -> ComparedRun:
+    """Return what there is to know of a run as a whole."""
+    return ComparedRun(
+        path=trace.name,
+        digest="" if is_native(trace) else trace.digest,
+        events=trace.event_count,
+        end_ns=trace.stamp(trace.end_ns),
+        complete=trace.complete,
+        stop_reason=stop_reason(trace),
+    )
+
+
+def interruptions(a: Trace, b: Trace) -> list[Remark]:
+    """Return a remark for each run whose recording was cut off."""
+    return [
+        TruncatedRecording(name, trace.name, trace.event_count, trace.end_ns)
+        for name, trace in (("a", a), ("b", b))
+        if not trace.complete
+    ]

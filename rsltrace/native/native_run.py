@@ -30,13 +30,7 @@ from rsltrace.run.provenance import (
     source_files,
     write_job,
 )
-from rsltrace.run.stop_rules import (
-    StopInputs,
-    conditions_of,
-    end_ns_of,
-    stop_rules,
-    watch_messages,
-)
+from rsltrace.run.stop_rules import StopInputs, conditions_of, end_ns_of, stop_rules, watch_messages
 from rsltrace.simulation.loop.policy import PriorityRule
 from rsltrace.simulation.loop.stop import Progress, Stop
 from rsltrace.simulation.middleware.events.failure import as_printed, exception_text

@@ -8,10 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.rclpy.boundary.installation import (
-    check_no_simulation,
-    native_extension,
-)
+from rsltrace.adapters.rclpy.boundary.installation import check_no_simulation, native_extension
 from rsltrace.errors import JobError, RunError
 from rsltrace.job import Job
 from rsltrace.native import support

@@ -109,9 +109,7 @@ if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.state_samples import StateSamples
     from rsltrace.simulation.chance.channel import NetworkPlan
-    from rsltrace.simulation.middleware.events.recorded_order_observer import (
-        RecordedOrderObserver,
-    )
+    from rsltrace.simulation.middleware.events.recorded_order_observer import RecordedOrderObserver
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
@@ -504,7 +502,7 @@ class RunSession:
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
         """Return the parts of the job without effect so far; ``lasted``: the run is over."""
-        from rsltrace.adapters.rclpy.parameters import parameters_of
+        from rsltrace.adapters.rclpy.handles.node import parameters_of
 
         domain = self.world.domain
         lasted_ns = self.loop.now_ns - self.start_ns if lasted else None

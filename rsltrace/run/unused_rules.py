@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from fnmatch import fnmatchcase
 
 from rsltrace.adapters.rclpy.arguments import RosArguments
-from rsltrace.adapters.rclpy.parameters import Parameters
+from rsltrace.adapters.rclpy.handles.node import Parameters
 from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc

@@ -35,17 +35,7 @@ LOAD = "CPU load"
 THREAD_COUNT = "thread counts"
 KERNEL = "BLAS core type"
 CORE_TYPE = "OPENBLAS_CORETYPE"
-KINDS = (
-    HASH_SEED,
-    FOLDER,
-    LOCALE,
-    TIME_ZONE,
-    HEAP,
-    ADDRESSES,
-    LOAD,
-    THREAD_COUNT,
-    KERNEL,
-)
+KINDS = (HASH_SEED, FOLDER, LOCALE, TIME_ZONE, HEAP, ADDRESSES, LOAD, THREAD_COUNT, KERNEL)
 
 _LOCALES = ("C", "C.UTF-8", "de_DE.UTF-8", "tr_TR.UTF-8", "POSIX", "ja_JP.UTF-8")
 _ZONES = ("UTC", "Asia/Kathmandu", "America/St_Johns", "Pacific/Apia", "XYZ+5:17")

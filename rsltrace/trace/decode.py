@@ -12,9 +12,11 @@ import dataclasses
 import math
 import re
 import struct
+from collections.abc import Iterator
 from copy import copy
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -29,10 +31,7 @@ from rsltrace.trace.cdr import WIDE_TEXT_TYPE, replace_wide_texts, restore_wide_
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.mcap import records as limits
 from rsltrace.trace.mcap.records import SCHEMA_ENCODING
-from rsltrace.trace.model.texts import PLACEHOLDERS
-
-if TYPE_CHECKING:
-    from rsltrace.trace.leaves import ValueField
+from rsltrace.trace.model.texts import NO_FIELD, PLACEHOLDERS
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)
 _CONSTANT_NAME = re.compile(r"[A-Z][A-Z0-9_]*", re.ASCII)
@@ -117,7 +116,6 @@ class Decoder:
 
     def leaves(self) -> list[ValueField]:
         """Return the fields of the message that hold values."""
-        from rsltrace.trace.leaves import leaves_of
 
         return leaves_of(self.name, self.types)
 
@@ -303,3 +301,44 @@ def _nesting(name: str, types: dict[str, Any], known: dict[str, int]) -> int:
             raise _UnsafeSchema(f"{name!r} contains itself or is nested too deeply")
         known[name] = max(inner)
     return known[name]
+
+
+# The fields of a type that hold values, at any depth.
+
+_DEPTH_MAX = 6
+
+
+@dataclass(frozen=True, slots=True)
+class ValueField:
+    """A field by its name, with ``[]`` behind each array, and the type of one value (``float32``,
+    ``string``; "" for messages).
+
+    With ``length_max`` it is an array itself, with at most that many items.
+    """
+
+    name: str
+    type: str
+    length_max: int | None = None
+
+
+def leaves_of(name: str, types: dict[str, Any]) -> list[ValueField]:
+    """Return the value fields of a type, which is defined in ``types``."""
+    return list(_leaves(name, types, "", _DEPTH_MAX))
+
+
+def _leaves(of: str, types: dict[str, Any], prefix: str, depth: int) -> Iterator[ValueField]:
+    for field, description in types[of][1]:
+        name, (kind, detail) = f"{prefix}{field}", description
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            (inner, inner_detail), size = detail
+            if kind == Nodetype.SEQUENCE:
+                base = inner_detail[0] if inner == Nodetype.BASE else ""
+                yield ValueField(name, base, size or 1 << 20)
+            name, kind, detail = f"{name}[]", inner, inner_detail
+        if kind == Nodetype.BASE:
+            if field != NO_FIELD:
+                yield ValueField(name, detail[0])
+        elif detail == WIDE_TEXT_TYPE:
+            yield ValueField(name, "string")
+        elif depth > 1:
+            yield from _leaves(detail, types, f"{name}.", depth - 1)

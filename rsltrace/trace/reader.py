@@ -68,8 +68,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from rsltrace.trace.decode import Decoder, Decoders
-    from rsltrace.trace.leaves import ValueField
+    from rsltrace.trace.decode import Decoder, Decoders, ValueField
     from rsltrace.trace.segments import SegmentReader
     from rsltrace.trace.tables import TraceTables
 

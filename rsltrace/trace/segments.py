@@ -26,13 +26,7 @@ from rsltrace.trace.dtypes import (
 from rsltrace.trace.format import CDR_HEADER, OUTPUT_HASHED
 from rsltrace.trace.index import SegmentTable, damage_error, read_chunk
 from rsltrace.trace.mcap.chunk_builder import MESSAGE_HEADER_DTYPE, ChunkBody, rows_chunk
-from rsltrace.trace.mcap.records import (
-    MESSAGE,
-    MESSAGE_HEAD,
-    RECORD_HEAD,
-    DamageError,
-    RecordSpan,
-)
+from rsltrace.trace.mcap.records import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, DamageError, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.model.event import (
     NO_SEQUENCE,

@@ -18,7 +18,17 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import nodes_called
 from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.phrases import as_sentence
-from rsltrace.why.delivery import Late, LostByLink, PushedOut, RunEnded, Unfinished, Waiting
+from rsltrace.why.delivery import (
+    ClockStands,
+    Late,
+    LostByLink,
+    PushedOut,
+    RunEnded,
+    TimerCancelled,
+    TimerLate,
+    Unfinished,
+    Waiting,
+)
 from rsltrace.why.filters import NoTransform, UnmatchedStamps
 from rsltrace.why.graph import (
     CreatedLate,
@@ -29,9 +39,7 @@ from rsltrace.why.graph import (
     NotReceived,
 )
 from rsltrace.why.history import RunHistory
-from rsltrace.why.question import SENDERS, WITH_CALLBACK, Question, filter_of
-from rsltrace.why.reason import Reason
-from rsltrace.why.timers import ClockStands, TimerCancelled, TimerLate
+from rsltrace.why.question import SENDERS, WITH_CALLBACK, Question, Reason, filter_of
 
 # Finds the callback that is meant, or why there is none.
 

@@ -15,8 +15,7 @@ from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, format_duration, printable, shortened
 from rsltrace.trace.words.logs import log_record
 from rsltrace.trace.words.phrases import seconds_text
-from rsltrace.why.question import Question, filter_of
-from rsltrace.why.reason import Reason
+from rsltrace.why.question import Question, Reason, filter_of
 
 _SHOWN = 3
 _SPOKEN = (OutputKind.LOG, OutputKind.EXCEPTION)

@@ -10,8 +10,7 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind, RandomDecision, decision_kind, decision_text
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable, shortened
-from rsltrace.why.question import SENDERS, Question, qos_of
-from rsltrace.why.reason import Reason
+from rsltrace.why.question import SENDERS, Question, Reason, qos_of
 
 _TEXT_MAX = 200
 _CRASHES = (RandomDecision.CRASH, RandomDecision.RESTART)

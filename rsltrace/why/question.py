@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import pairwise
 from statistics import median
-from typing import Any
+from typing import Any, ClassVar
 
 from rsltrace.simulation.middleware.qos.policies import Qos, incompatible_policies
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, OutputKind
 from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.words.code import entity_places
-from rsltrace.trace.words.phrases import exception_of
+from rsltrace.trace.words.phrases import exception_of, seconds_text
 from rsltrace.why.history import Message, Occupation, RunHistory
 
 SENDERS = {
@@ -167,3 +168,56 @@ def filter_of(entity: Entity) -> tuple[str, str, int] | None:
     if not isinstance(of, dict) or not isinstance(of.get("slop_ns"), int):
         return None
     return str(of.get("callback")), str(of.get("source")), of["slop_ns"]
+
+
+# What all reasons have.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reason:
+    """Why a callback did not run. Times are simulated nanoseconds; entities are named as in
+    sentences.
+
+    ``place`` is the line of code (``module.py:24``) of what is to blame, ``event`` the one to look
+    at; "" and None if unknown.
+    """
+
+    is_reason: ClassVar[bool] = True
+    """Whether something kept the callback from running; else another reason is looked for."""
+    question: Question
+    place: str = ""
+    event: int | None = None
+
+    @property
+    def kind(self) -> str:
+        """What programs call it: ``pushed_out``."""
+        return re.sub("(?<=[a-z])(?=[A-Z])", "_", type(self).__name__).lower()
+
+    @classmethod
+    def find(cls, question: Question) -> Reason | None:
+        """Return the reason, None if it does not hold."""
+        raise NotImplementedError
+
+    def seconds(self, stamp_ns: int) -> str:
+        """Return a time in seconds since the start of the run: ``1.5``."""
+        return seconds_text(self.question.history.trace.stamp(stamp_ns))
+
+    def when(self, stamp_ns: int) -> str:
+        """Return a time as part of a sentence: ``at 1.5 s``."""
+        return f"at {self.seconds(stamp_ns)} s"
+
+    def words(self) -> str:
+        """Return a sentence without its full stop."""
+        raise NotImplementedError
+
+    def clause(self) -> str:
+        """Return the reason as what follows "because" in the sentence of another one."""
+        return self.words()
+
+    def because(self) -> Reason | None:
+        """Return the reason behind this one, if there is one."""
+        return None
+
+    def evidence(self) -> Iterator[str]:
+        """Yield lines that show what the trace says, beside the counts and the event."""
+        yield from ()

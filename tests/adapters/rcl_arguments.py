@@ -134,12 +134,7 @@ def _library() -> Any:
         ("rcl_remap_node_name", 1),
         ("rcl_remap_node_namespace", 1),
     ):
-        getattr(rcl, name).argtypes = (
-            *two,
-            *(c_char_p,) * strings,
-            _Allocator,
-            POINTER(c_void_p),
-        )
+        getattr(rcl, name).argtypes = (*two, *(c_char_p,) * strings, _Allocator, POINTER(c_void_p))
     rcl.rcutils_get_error_string.restype = _ErrorString
     rcl.rcutils_error_is_set.restype = c_bool
     yaml.rcl_yaml_node_struct_fini.argtypes = (POINTER(_Params),)

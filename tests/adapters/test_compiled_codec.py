@@ -25,13 +25,7 @@ from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path
 from sensor_msgs.msg import Image, Imu, JointState
 from std_msgs.msg import Float32, Float64, String
-from test_msgs.msg import (
-    Arrays,
-    BoundedSequences,
-    Nested,
-    UnboundedSequences,
-    WStrings,
-)
+from test_msgs.msg import Arrays, BoundedSequences, Nested, UnboundedSequences, WStrings
 
 from rsltrace import compiled
 from rsltrace.adapters.rclpy.messages import codec as codecs
@@ -40,14 +34,7 @@ from rsltrace.adapters.rclpy.messages.decoder_source import make_deserializer
 from rsltrace.adapters.rclpy.messages.encoder_source import make_serializer
 from rsltrace.adapters.rclpy.messages.interfaces import type_name
 from rsltrace.adapters.rclpy.messages.message_spec import HEADER, message_spec
-from tests.adapters.test_codec import (
-    CLASSES,
-    QUICK,
-    Shouting,
-    every_class,
-    random_message,
-    same,
-)
+from tests.adapters.test_codec import CLASSES, QUICK, Shouting, every_class, random_message, same
 from tests.tiers import cases
 
 pytestmark = [

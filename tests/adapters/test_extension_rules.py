@@ -14,11 +14,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rsltrace.adapters.rclpy import arguments, names
+from rsltrace.adapters.rclpy.arguments import LEVELS, LogLevels
 from rsltrace.adapters.rclpy.boundary import extension
 from rsltrace.adapters.rclpy.boundary.boundary import _TYPES
 from rsltrace.adapters.rclpy.boundary.installation import boundary
 from rsltrace.adapters.rclpy.handles.qos_profiles import compatibility
-from rsltrace.adapters.rclpy.log_levels import LEVELS, LogLevels
 from tests.adapters import rcl_arguments
 
 pytestmark = pytest.mark.ros

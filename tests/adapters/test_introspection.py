@@ -90,8 +90,8 @@ def test_descriptions_hash_to_the_installed_type_hashes() -> None:
     from test_msgs.action import Fibonacci
     from test_msgs.msg import Arrays
 
+    from rsltrace.adapters.rclpy.handles.services import type_description
     from rsltrace.adapters.rclpy.messages.interfaces import type_hash
-    from rsltrace.adapters.rclpy.messages.type_descriptions import type_description
 
     for interface in (String, PointCloud2, Arrays, SetBool, SetBool.Event, Fibonacci):
         found = type_description(interface)

@@ -132,11 +132,7 @@ def test_what_no_timer_has_caused_has_the_rate_of_its_node(order: Any) -> None:
             super().__init__("once")
             self.create_publisher(String, "a", 10).publish(String())
 
-    makers = (
-        lambda: listener("slow", "a", 500),
-        lambda: listener("fast", "a", 90),
-        Once,
-    )
+    makers = (lambda: listener("slow", "a", 500), lambda: listener("fast", "a", 90), Once)
     assert order(*makers, policy="fifo") == ["slow", "fast"]
     assert order(*makers, policy="rate_monotonic") == ["fast", "slow"]
 

@@ -141,9 +141,7 @@ def test_every_primitive_waits_in_simulated_time(simulate: Any) -> None:
     ]  # fmt: skip
 
 
-def test_locks_exclude_threads_that_are_suspended_and_idents_tell_them_apart(
-    simulate: Any,
-) -> None:
+def test_locks_exclude_threads_that_are_suspended_and_idents_tell_them_apart(simulate: Any) -> None:
     log: list[Any] = []
 
     class Workers(Node):
@@ -624,9 +622,7 @@ def test_threads_that_have_ended_are_forgotten(simulate: Any) -> None:
 
 
 @pytest.mark.long
-def test_a_timer_is_written_down_although_a_thread_spins_its_node_only_later(
-    simulate: Any,
-) -> None:
+def test_a_timer_is_written_down_although_a_thread_spins_its_node_only_later(simulate: Any) -> None:
     def main() -> None:
         rclpy.init()
         node = Node("late")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.trace.recordings.merge import BagMessage, RecordingPart, merge
+from rsltrace.trace.recordings.topic import BagMessage, RecordingPart, merge
 
 stamps = st.lists(st.integers(0, 30), max_size=8).map(sorted)
 # A piece may start earlier than its first message: a start is a promise, not a message.

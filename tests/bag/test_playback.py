@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.trace.recordings.merge import BagMessage
 from rsltrace.trace.recordings.playback import reordered
+from rsltrace.trace.recordings.topic import BagMessage
 
 
 @given(st.lists(st.integers(0, 50), max_size=60))

@@ -203,10 +203,7 @@ def test_requests_never_arrive_twice_nor_wait_for_a_copy() -> None:
 def test_the_most_precise_rule_counts() -> None:
     plan = NetworkPlan(
         links=(LinkRule("/t", "*", "/slow", LinkModel(Constant(1))),),
-        topics=(
-            NameRule("/*", LinkModel(Constant(2))),
-            NameRule("/t", LinkModel(Constant(3))),
-        ),
+        topics=(NameRule("/*", LinkModel(Constant(2))), NameRule("/t", LinkModel(Constant(3)))),
         services=(NameRule("/s", LinkModel(Constant(4))),),
         default=LinkModel(Constant(5)),
     )

@@ -26,8 +26,7 @@ from rsltrace.simulation.chance.distribution import (
     Uniform,
     normal_quantile,
 )
-from rsltrace.simulation.chance.portable_math import exp, log
-from rsltrace.simulation.chance.stream import RandomStream
+from rsltrace.simulation.chance.stream import RandomStream, exp, log
 
 N = 100_000
 MS = 1_000_000

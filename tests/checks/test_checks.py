@@ -13,15 +13,7 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace import (
-    CheckResult,
-    Job,
-    NodeSpec,
-    Trace,
-    evaluate_checks,
-    load_job,
-    measure_latencies,
-)
+from rsltrace import CheckResult, Job, NodeSpec, Trace, evaluate_checks, load_job, measure_latencies
 from rsltrace.checks.properties import EventuallyProperty, NeverProperty, RateProperty, RunProperty
 from rsltrace.cli.main import cli
 from rsltrace.conditions.condition import ActiveCondition

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from rsltrace import DebugSession
+    from rsltrace.trace.reader import Trace
 
 NODES = """
 from rclpy.node import Node
@@ -89,3 +95,28 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (made / "job.yaml").write_text(JOB)
     record(load_job(made / "job.yaml"), made / "run.mcap")
     return made
+
+
+@pytest.fixture(scope="module")
+def shared(folder: Path) -> Iterator[DebugSession]:
+    from rsltrace import DebugSession
+
+    with DebugSession(folder / "run.mcap", trust=True) as session:
+        yield session
+
+
+@pytest.fixture
+def session(shared: DebugSession) -> DebugSession:
+    """The session of a module, at its begin and without breakpoints."""
+    for one in shared.breakpoints:
+        shared.clear(one.number)
+    shared.go_to(0)
+    return shared
+
+
+@pytest.fixture(scope="module")
+def trace(folder: Path) -> Iterator[Trace]:
+    from rsltrace.trace.reader import Trace
+
+    with Trace.open(folder / "run.mcap") as opened:
+        yield opened

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -91,34 +90,13 @@ LINES = ("", *NODES.splitlines())
 
 
 @pytest.fixture(scope="module")
-def waiting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A job whose callbacks and main wait, and its trace."""
-    folder = tmp_path_factory.mktemp("waiting")
-    (folder / "waiting_nodes.py").write_text(NODES)
-    (folder / "job.yaml").write_text(JOB)
-    record(load_job(folder / "job.yaml"), folder / "run.mcap")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def shared(waiting: Path) -> Iterator[DebugSession]:
-    with DebugSession(waiting / "run.mcap", trust=True) as session:
-        yield session
-
-
-@pytest.fixture
-def session(shared: DebugSession) -> DebugSession:
-    """The session of this module, at its begin and without breakpoints."""
-    for one in shared.breakpoints:
-        shared.clear(one.number)
-    shared.go_to(0)
-    return shared
-
-
-@pytest.fixture(scope="module")
-def trace(waiting: Path) -> Iterator[Trace]:
-    with Trace.open(waiting / "run.mcap") as opened:
-        yield opened
+    made = tmp_path_factory.mktemp("waiting")
+    (made / "waiting_nodes.py").write_text(NODES)
+    (made / "job.yaml").write_text(JOB)
+    record(load_job(made / "job.yaml"), made / "run.mcap")
+    return made
 
 
 def events_of(trace: Trace, name: str) -> list[int]:
@@ -234,9 +212,9 @@ def test_a_message_is_received_once(session: DebugSession, trace: Trace) -> None
     ]
 
 
-def test_what_the_viewer_says_of_those_that_go_on(waiting: Path) -> None:
+def test_what_the_viewer_says_of_those_that_go_on(folder: Path) -> None:
     """A main that has run a callback on its own stack goes on because of it, with nothing of it."""
-    run = Run.open(waiting / "run.mcap")
+    run = Run.open(folder / "run.mcap")
     events = [run.event(index) for index in range(run.count)]
     inputs = [run.input_of(one) for one in events if one.kind is EventKind.RESUME]
     assert {None if one is None else one.kind for one in inputs} == {None, OutputKind.TASK}
@@ -250,10 +228,10 @@ def test_what_the_viewer_says_of_those_that_go_on(waiting: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_main_of_a_job_that_nobody_has_recorded(waiting: Path, trace: Trace) -> None:
+def test_a_main_of_a_job_that_nobody_has_recorded(folder: Path, trace: Trace) -> None:
     """Whether one that spins does something is known only when it has; then it is known."""
     wanted = events_of(trace, "waiting_nodes:main")
-    with DebugSession(waiting / "job.yaml") as session:
+    with DebugSession(folder / "job.yaml") as session:
         session.break_at("entity waiting_nodes:main")
         first = [stop.position for stop in stops(session)]
         assert [one.index - (not one.is_next) for one in first] == wanted

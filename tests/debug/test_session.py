@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,27 +11,6 @@ from rsltrace import DebugSession
 from rsltrace.errors import ConditionError, DebugError, EditError, OutputError, ReplayError
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.events import EventWords
-
-
-@pytest.fixture(scope="module")
-def shared(folder: Path) -> Iterator[DebugSession]:
-    with DebugSession(folder / "run.mcap", trust=True) as session:
-        yield session
-
-
-@pytest.fixture
-def session(shared: DebugSession) -> DebugSession:
-    """The session of this module, at its begin and without breakpoints."""
-    for one in shared.breakpoints:
-        shared.clear(one.number)
-    shared.go_to(0)
-    return shared
-
-
-@pytest.fixture(scope="module")
-def trace(folder: Path) -> Iterator[Trace]:
-    with Trace.open(folder / "run.mcap") as opened:
-        yield opened
 
 
 def test_an_exception_of_several_lines_is_known_by_its_type(

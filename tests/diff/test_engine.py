@@ -237,11 +237,7 @@ def test_lines_of_a_job_of_several_files_are_not_those_of_one(tmp_path: Path) ->
         tmp_path, Fault("bit", step(20, 1)), a=replace(PLAN, job_heading=heading), b=other
     )
     (setting,) = diff.settings
-    assert (setting.place, setting.a, setting.b) == (
-        "effective job.yaml:2",
-        "seed: 0",
-        "seed: 7",
-    )
+    assert (setting.place, setting.a, setting.b) == ("effective job.yaml:2", "seed: 0", "seed: 7")
 
 
 def test_a_constructor_that_differs(tmp_path: Path) -> None:

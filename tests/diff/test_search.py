@@ -87,10 +87,7 @@ def test_few_segments_are_read(tmp_path: Path, per_segment: tuple[int, int]) -> 
                 reads.append(offset)  # noqa: B023  # used within the iteration
                 return super().read_at(offset, length)
 
-        with (
-            Trace(Counting(tmp_path / "a.mcap")) as a,
-            Trace(Counting(tmp_path / "b.mcap")) as b,
-        ):
+        with Trace(Counting(tmp_path / "a.mcap")) as a, Trace(Counting(tmp_path / "b.mcap")) as b:
             reads.clear()
             assert first_difference(a, b) == at
             most = 2 if per_segment[0] == per_segment[1] else 2 * len(bin(len(a.segments)))

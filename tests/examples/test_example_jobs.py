@@ -56,9 +56,7 @@ def test_a_measured_job_has_the_callbacks_it_says(
     assert result.events == pytest.approx(callbacks, abs=250)
 
 
-def test_the_robot_drives_its_laps_and_knows_where_it_is(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_the_robot_drives_its_laps_and_knows_where_it_is(capfd: pytest.CaptureFixture[str]) -> None:
     result, log = run("sensor_fusion/job.yaml", capfd)
     assert result.events <= 40_000
     assert result.sim_seconds == "60.000000000"

@@ -344,10 +344,7 @@ def recorded(path: Path, node: Any, state: object, at: int, change: Callable[[An
     from rsltrace import Job, NodeSpec, StopSpec, record
 
     PLANTED.update(at=at, change=change)
-    job = Job(
-        nodes=[NodeSpec(node=node, guard={"state": state})],
-        stop=StopSpec(duration="1s"),
-    )
+    job = Job(nodes=[NodeSpec(node=node, guard={"state": state})], stop=StopSpec(duration="1s"))
     record(job, path, force=True)
     return path
 

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.adapters.launch.api.basics import LaunchContext
-from rsltrace.adapters.launch.expression import evaluate
 from rsltrace.adapters.launch.model import LaunchScope
-from rsltrace.adapters.launch.substitution import SubstitutionCall, parse_template
+from rsltrace.adapters.launch.substitution import SubstitutionCall, evaluate, parse_template
 
 
 def text(written: str) -> str:

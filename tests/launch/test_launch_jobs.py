@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace import Job, Trace
-from rsltrace.adapters.launch.file_lookup import launch_file
+from rsltrace.adapters.launch.specs import launch_file
 from rsltrace.errors import JobError
 from rsltrace.job import LaunchSpec, load_job
 from rsltrace.run import run
@@ -136,9 +136,7 @@ def test_a_launch_file_in_a_job(rsltrace: Command, folder: Path) -> None:
     assert also.stdout == done.stdout
 
 
-def test_words_that_do_not_fit_together(
-    rsltrace: Command,
-) -> None:
+def test_words_that_do_not_fit_together(rsltrace: Command) -> None:
     for arguments, message in [
         ((), "Missing argument 'JOB' (or --launch FILE, or -- PROGRAM)"),
         (("--set", "seed=1"), "Missing argument 'JOB' (or --launch FILE, or -- PROGRAM)"),

@@ -30,11 +30,7 @@ from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.stop import Stop, stop_after_events, stop_at
 from rsltrace.simulation.loop.timer_queue import TimerState, timer_queue
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher, EventEnd, PythonEventEnd
-from rsltrace.simulation.middleware.events.observer import (
-    EventCall,
-    EventObserver,
-    ObserverOrder,
-)
+from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.links import Network, fast_send
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher, Transport

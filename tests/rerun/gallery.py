@@ -89,11 +89,7 @@ def messages(step: int, stamp_ns: int, shift: float = 0.0) -> dict[str, tuple[st
     ]
     image = np.full((8, 8, 3), step % 256, dtype=np.uint8)
     stamped = [
-        new(
-            "geometry_msgs/msg/PoseStamped",
-            header=odom,
-            pose=pose(math.cos(a), math.sin(a)),
-        )
+        new("geometry_msgs/msg/PoseStamped", header=odom, pose=pose(math.cos(a), math.sin(a)))
         for a in np.linspace(0, 6, 20).tolist()
     ]
     transform = new(

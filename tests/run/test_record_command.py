@@ -259,12 +259,7 @@ def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_
         "        print('stuck', flush=True)\n"
         "        while True: pass\n",
     )
-    process = _start(tmp_path)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "stuck\n"
-    process.send_signal(signal.SIGINT)
-    assert process.stderr is not None
-    assert any("closing the trace" in line for line in process.stderr), "the first one has come"
+    process = _interrupted(tmp_path)
     assert process.poll() is None
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=300)
@@ -285,12 +280,7 @@ def test_a_second_interrupt_ends_an_endless_recursion(job_file: Any, tmp_path: P
         "        if n == 200_000: print('stuck', flush=True)\n"
         "        self.f(n + 1)\n",
     )
-    process = _start(tmp_path)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "stuck\n"
-    assert process.stderr is not None
-    process.send_signal(signal.SIGINT)
-    assert any("closing the trace" in line for line in process.stderr), "the first one has come"
+    process = _interrupted(tmp_path)
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=300)
     assert process.returncode == 130
@@ -312,12 +302,7 @@ def test_a_third_interrupt_ends_a_process_that_swallows_the_second(
         "                while True: sum(range(9))\n"
         "            except KeyboardInterrupt: print('swallowed', flush=True)\n",
     )
-    process = _start(tmp_path)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "stuck\n"
-    assert process.stderr is not None
-    process.send_signal(signal.SIGINT)
-    assert any("closing the trace" in line for line in process.stderr), "the first one has come"
+    process = _interrupted(tmp_path)
     _let_it_run(process.pid, 0.5)  # its handler is over
     process.send_signal(signal.SIGINT)
     assert process.stdout.readline() == "swallowed\n"
@@ -439,6 +424,17 @@ def _start(folder: Path) -> subprocess.Popen[str]:
         text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )
+
+
+def _interrupted(folder: Path) -> subprocess.Popen[str]:
+    """Start a run whose callback hangs and prints ``stuck``, and interrupt it once."""
+    process = _start(folder)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    assert process.stdout.readline() == "stuck\n"
+    process.send_signal(signal.SIGINT)
+    assert any("closing the trace" in line for line in process.stderr), "the first one has come"
+    return process
 
 
 def _wait_for_bytes(path: Path, size: int) -> None:

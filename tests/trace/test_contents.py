@@ -155,9 +155,7 @@ def test_what_cannot_be_read_is_told_with_the_file(
     assert str(raised.value).startswith(f"{path}: ")
 
 
-def test_a_record_that_lies_about_its_length_under_right_checksums_is_found(
-    tmp_path: Path,
-) -> None:
+def test_a_record_that_lies_about_its_length_under_right_checksums_is_found(tmp_path: Path) -> None:
     """Reading goes by the summary and never meets it; other tools walk the file and do."""
     with SAMPLE.open("rb") as file:
         data = bytearray(file.read())

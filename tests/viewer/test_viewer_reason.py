@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from rsltrace_viewer.terminal.screens.text import TextScreen
 
-from rsltrace.cli.why import why
+from rsltrace.cli.cat import why
 from rsltrace.trace.model.event import EventKind
 
 Drive = Callable[..., None]

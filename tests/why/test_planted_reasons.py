@@ -16,12 +16,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 from rsltrace.errors import TraceError
 from rsltrace.job import load_job
 from rsltrace.run import run
-from rsltrace.simulation.middleware.qos.policies import (
-    DEFAULT_QOS,
-    Liveliness,
-    Qos,
-    Reliability,
-)
+from rsltrace.simulation.middleware.qos.policies import DEFAULT_QOS, Liveliness, Qos, Reliability
 from rsltrace.trace.reader import Trace
 from rsltrace.why.answer import why
 
@@ -177,9 +172,7 @@ PLANTED = [
         at="500ms",
         says="began at 0.45 s and had not ended at 0.5 s",
     ),
-    Planted(
-        *("waits", "crashes", "numbers", "node_ended", "/crashes ended at 0.35 s", "Worker"),
-    ),
+    Planted(*("waits", "crashes", "numbers", "node_ended", "/crashes ended at 0.35 s", "Worker")),
     Planted("waits", "hangs", "numbers", "busy", "node /hangs hung from 0.35 s", "Worker"),
     Planted(
         *("constructor", "broken", "numbers", "not_constructed", "its constructor raised"),

@@ -116,11 +116,7 @@ def test_natively_they_are_refused_by_name(caches: Path) -> None:
 
 
 def test_the_files_are_understood_and_have_no_comments() -> None:
-    from rosidl_adapter.parser import (
-        parse_action_file,
-        parse_message_file,
-        parse_service_file,
-    )
+    from rosidl_adapter.parser import parse_action_file, parse_message_file, parse_service_file
 
     parse = {".msg": parse_message_file, ".srv": parse_service_file, ".action": parse_action_file}
     packages = bundled_packages()

@@ -169,10 +169,7 @@ def exception(rng: random.Random, world: World) -> Change:
 @behaviour("exit")
 def exits(rng: random.Random, world: World) -> Change:
     node = one_of(rng, world, "source", "relay")
-    truth = Truth(
-        ("ended-early", *OUTPUT, "exception"),
-        says=(r"(raised|exit)",),
-    )
+    truth = Truth(("ended-early", *OUTPUT, "exception"), says=(r"(raised|exit)",))
     return Change(node, ["raise SystemExit(3)"], truth, at=rng.randint(2, 6))
 
 

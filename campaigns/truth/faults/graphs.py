@@ -5,12 +5,14 @@ from __future__ import annotations
 import random
 import re
 from dataclasses import replace
+from functools import partial
 
 from campaigns.truth.faults.planting import Planted, Truth, fault, one_of
 from campaigns.truth.faults.settings import NEVER
 from campaigns.truth.graph import NodePlan, random_world
 
 GRAPH = ("graph",)
+_truth = partial(Truth, GRAPH, never=NEVER, independent=None)
 
 
 @fault("renamed node")
@@ -19,13 +21,7 @@ def renamed(rng: random.Random) -> Planted:
     node = one_of(rng, a, "source", "relay", "sink")
     b = a.copy()
     b.entry(node.name)["name"] = "other_name"
-    truth = Truth(
-        GRAPH,
-        first=(rf"{node.full_name} .*renamed to /other_name",),
-        says=(r"name",),
-        never=NEVER,
-        independent=None,
-    )
+    truth = _truth(first=(rf"{node.full_name} .*renamed to /other_name",), says=(r"name",))
     return Planted(a, b, truth)
 
 
@@ -38,12 +34,9 @@ def renamed_in_code(rng: random.Random) -> Planted:
     text = f"super().__init__({node.name!r})"
     other.setup.insert(0, "pass")
     _rename(other, text)
-    truth = Truth(
-        GRAPH,
+    truth = _truth(
         first=(rf"{node.full_name} .*renamed to /other_name",),
         says=(rf"code of module {node.module}",),
-        never=NEVER,
-        independent=None,
     )
     return Planted(a, b, truth)
 
@@ -63,12 +56,8 @@ def namespace(rng: random.Random) -> Planted:
     node = one_of(rng, a, "source", "relay", "sink")
     b = a.copy()
     b.entry(node.name)["namespace"] = "/robot"
-    truth = Truth(
-        GRAPH,
-        first=(rf"{node.full_name} .*renamed to /robot{node.full_name}",),
-        says=(r"namespace",),
-        never=NEVER,
-        independent=None,
+    truth = _truth(
+        first=(rf"{node.full_name} .*renamed to /robot{node.full_name}",), says=(r"namespace",)
     )
     return Planted(a, b, truth)
 
@@ -80,13 +69,8 @@ def remapped(rng: random.Random) -> Planted:
     topic = node.callbacks[0].publishes
     b = a.copy()
     b.entry(node.name)["remappings"] = {topic: "/elsewhere"}
-    truth = Truth(
-        GRAPH,
-        node.full_name,
-        first=(rf"{re.escape(topic)}.*/elsewhere",),
-        says=(r"remappings",),
-        never=NEVER,
-        independent=None,
+    truth = _truth(
+        node.full_name, first=(rf"{re.escape(topic)}.*/elsewhere",), says=(r"remappings",)
     )
     return Planted(a, b, truth)
 
@@ -100,13 +84,10 @@ def topic_in_code(rng: random.Random) -> Planted:
     b.node(node.name).setup = [
         line.replace(f'"{topic}"', '"/elsewhere"') for line in b.node(node.name).setup
     ]
-    truth = Truth(
-        GRAPH,
+    truth = _truth(
         node.full_name,
         first=(rf"{re.escape(topic)}.*/elsewhere",),
         says=(rf"code of module {node.module}",),
-        never=NEVER,
-        independent=None,
     )
     return Planted(a, b, truth)
 
@@ -122,13 +103,7 @@ def extra(rng: random.Random) -> Planted:
     b.nodes.append(_spare("spare"))
     at = rng.randint(0, len(b.job["nodes"]))
     b.job["nodes"].insert(at, {"node": "truth_spare:Spare"})
-    truth = Truth(
-        GRAPH,
-        first=(r"/spare is constructed in b but not in a",),
-        says=(r"nodes",),
-        never=NEVER,
-        independent=None,
-    )
+    truth = _truth(first=(r"/spare is constructed in b but not in a",), says=(r"nodes",))
     return Planted(a, b, truth)
 
 
@@ -138,13 +113,7 @@ def missing(rng: random.Random) -> Planted:
     node = one_of(rng, a, "sink", "source", "relay")
     b = a.copy()
     b.job["nodes"].remove(b.entry(node.name))
-    truth = Truth(
-        GRAPH,
-        first=(rf"{node.full_name} is constructed in a but not in b",),
-        says=(r"nodes",),
-        never=NEVER,
-        independent=None,
-    )
+    truth = _truth(first=(rf"{node.full_name} is constructed in a but not in b",), says=(r"nodes",))
     return Planted(a, b, truth)
 
 
@@ -154,13 +123,8 @@ def publisher(rng: random.Random) -> Planted:
     node = one_of(rng, a, "source", "relay", "sink")
     b = a.copy()
     b.node(node.name).setup.append('self.more = self.create_publisher(Float64, "/more", 10)')
-    truth = Truth(
-        GRAPH,
-        node.full_name,
-        first=(r"/more only in b",),
-        says=(rf"code of module {node.module}",),
-        never=NEVER,
-        independent=None,
+    truth = _truth(
+        node.full_name, first=(r"/more only in b",), says=(rf"code of module {node.module}",)
     )
     return Planted(a, b, truth)
 
@@ -173,13 +137,8 @@ def subscription(rng: random.Random) -> Planted:
     b.node(node.name).setup.append(
         'self.more = self.create_subscription(Float64, "/s0", lambda message: None, 10)'
     )
-    truth = Truth(
-        GRAPH,
-        node.full_name,
-        first=(r"/s0 only in b",),
-        says=(rf"code of module {node.module}",),
-        never=NEVER,
-        independent=None,
+    truth = _truth(
+        node.full_name, first=(r"/s0 only in b",), says=(rf"code of module {node.module}",)
     )
     return Planted(a, b, truth)
 

@@ -75,12 +75,7 @@ def _program(
 
 
 for _what, _main in (("a main", ["node.run()"]), ("a thread", THREAD)):
-    _program(
-        f"value in {_what}",
-        _main,
-        ["value += 4.0"],
-        r"/program\W+data \d+\.\d → \d+\.\d",
-    )
+    _program(f"value in {_what}", _main, ["value += 4.0"], r"/program\W+data \d+\.\d → \d+\.\d")
     _program(f"sleep in {_what}", _main, ["time.sleep(0.003)"], r"3 ms")
     _program(
         f"exception in {_what}",

@@ -37,12 +37,7 @@ def message(
 
 message("text", 'String(data="ready")', 'typed.data = "steady"', 'data "ready" → "steady"')
 message("text that is gone", 'String(data="on")', 'typed.data = ""', 'data "on" → ""')
-message(
-    "text in two lines",
-    'String(data="a b")',
-    'typed.data = "a\\nb"',
-    r'data "a b" → "a\\nb"',
-)
+message("text in two lines", 'String(data="a b")', 'typed.data = "a\\nb"', r'data "a b" → "a\\nb"')
 message(
     "NaN", "Float64(data=2.5)", 'typed.data = float("nan")', r"data 2\.5 → nan", shows=("NaN in b",)
 )
@@ -148,12 +143,7 @@ message(
     r'header\.frame_id "" → "map" and 1 more field',
     shows=(r"pose\.orientation\.z",),
 )
-message(
-    "stamp",
-    "PoseStamped()",
-    "typed.header.stamp.sec = 7",
-    r"header\.stamp 0\.0* → 7\.0*",
-)
+message("stamp", "PoseStamped()", "typed.header.stamp.sec = 7", r"header\.stamp 0\.0* → 7\.0*")
 message(
     "payload that was not recorded",
     'String(data="ready")',

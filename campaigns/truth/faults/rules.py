@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+from functools import partial
 from typing import Any
 
 from campaigns.truth.faults.planting import NOT_DETERMINISTIC, Planted, Truth, fault, one_of
@@ -30,6 +31,9 @@ def _link(
     link = {"topic": node.hears[0], "to": node.full_name, "constant": 0}
     a.job["delay"] = {"links": [{**link, **a_rule}]}
     return a, changed(a, "delay", {"links": [{**link, **b_rule}]}), node
+
+
+_truth = partial(Truth, never=NEVER, independent=None)
 
 
 @fault("second copies")
@@ -81,7 +85,7 @@ def service_delay(rng: random.Random) -> Planted:
     a.job["delay"] = {"services": {"/ask": "1ms"}}
     b = changed(a, "delay", {"services": {"/ask": "3ms"}})
     first = (r"1 ms.* 3 ms", "/ask")
-    truth = Truth(("draw", "timing"), first=first, says=(r"delay",), never=NEVER, independent=None)
+    truth = _truth(("draw", "timing"), first=first, says=(r"delay",))
     return Planted(a, b, truth)
 
 
@@ -91,9 +95,7 @@ def execution(rng: random.Random) -> Planted:
     a.job["execution"] = {"default": "100us"}
     b = changed(a, "execution", {"default": "300us"})
     first = (r"100 (us|µs).* 300 (us|µs)",)
-    truth = Truth(
-        ("draw", "timing"), first=first, says=(r"execution",), never=NEVER, independent=None
-    )
+    truth = _truth(("draw", "timing"), first=first, says=(r"execution",))
     return Planted(a, b, truth)
 
 
@@ -119,7 +121,7 @@ def permutation(rng: random.Random) -> Planted:
     a, _ = _two_sources(rng)
     a.job["policy"] = "permutation"
     b = changed(a, "seed", a.job["seed"] + 1)
-    truth = Truth(("schedule",), says=(r"\bseed\b",), never=NEVER, independent=None)
+    truth = _truth(("schedule",), says=(r"\bseed\b",))
     return Planted(a, b, truth)
 
 
@@ -147,7 +149,7 @@ def _bag(rng: random.Random, options: dict[str, Any], *says: str) -> Planted:
     a = random_world(rng, bag=True)
     b = a.copy()
     b.bag_options = options
-    return Planted(a, b, Truth((), says=(r"bags?\b", *says), never=NEVER, independent=None))
+    return Planted(a, b, _truth((), says=(r"bags?\b", *says)))
 
 
 @fault("bag: rate")
@@ -171,7 +173,7 @@ def from_command_line(rng: random.Random) -> Planted:
     node = one_of(rng, a, "source")
     a.job["ros_arguments"] = ["-p", f"{node.name}:gain:=2.5"]
     b = changed(a, "ros_arguments", ["-p", f"{node.name}:gain:=2.75"])
-    truth = Truth((), node.full_name, says=(r"ros_arguments|gain",), never=NEVER, independent=None)
+    truth = _truth((), node.full_name, says=(r"ros_arguments|gain",))
     return Planted(a, b, truth)
 
 
@@ -186,9 +188,7 @@ def parameter_file(rng: random.Random) -> Planted:
     entry["parameter_files"] = ["one.yaml"]
     b = a.copy()
     b.entry(node.name)["parameter_files"] = ["other.yaml"]
-    truth = Truth(
-        (), node.full_name, says=(r"parameter_files|gain",), never=NEVER, independent=None
-    )
+    truth = _truth((), node.full_name, says=(r"parameter_files|gain",))
     return Planted(a, b, truth)
 
 
@@ -198,4 +198,4 @@ def starts_later(rng: random.Random) -> Planted:
     node = one_of(rng, a, "source")
     b = a.copy()
     b.entry(node.name)["start_after"] = {"delay": "50ms"}
-    return Planted(a, b, Truth(says=(r"start_after",), never=NEVER, independent=None))
+    return Planted(a, b, _truth(says=(r"start_after",)))

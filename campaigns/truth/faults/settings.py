@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+from functools import partial
 from typing import Any
 
 from campaigns.truth.faults.planting import (
@@ -17,6 +18,7 @@ from campaigns.truth.faults.planting import (
 from campaigns.truth.graph import Callback, NodePlan, World, random_world
 
 NEVER = (*ALWAYS_FALSE, NOT_DETERMINISTIC)
+_truth = partial(Truth, never=NEVER)
 
 
 def changed(a: World, key: str, value: Any) -> World:
@@ -34,7 +36,7 @@ def parameter(rng: random.Random) -> Planted:
     value = node.parameters["gain"] + rng.choice((0.05, 1.0))
     b.entry(node.name)["parameters"]["gain"] = value
     says = (r"gain", rf"{node.parameters['gain']}\b.*{re.escape(str(value))}")
-    return Planted(a, b, Truth(("environment",), node.full_name, says=says, never=NEVER))
+    return Planted(a, b, _truth(("environment",), node.full_name, says=says))
 
 
 @fault("constant in code")
@@ -48,13 +50,12 @@ def constant(rng: random.Random) -> Planted:
     return Planted(
         a,
         b,
-        Truth(
+        _truth(
             ("same-input-different-output",),
             node.full_name,
             node.callbacks[0].entity,
             first=(topic,),
             says=(rf"code of module {node.module}",),
-            never=NEVER,
             values=node.callbacks[0].publishes,
         ),
     )
@@ -72,13 +73,12 @@ def period(rng: random.Random) -> Planted:
     return Planted(
         a,
         b,
-        Truth(
+        _truth(
             ("timing", "extra", "missing"),
             node.full_name,
             node.callbacks[0].entity,
             first=(rf"period.*{was} → {now} ms",),
             says=(rf"code of module {node.module}",),
-            never=NEVER,
         ),
     )
 
@@ -122,7 +122,7 @@ def constant_delay(rng: random.Random) -> Planted:
     a.job["delay"] = {"topics": {topic: "2ms"}}
     b = changed(a, "delay", {"topics": {topic: "5ms"}})
     first = (r"2 ms.* 5 ms", re.escape(topic))
-    return Planted(a, b, Truth(("draw", "timing"), first=first, says=(r"delay",), never=NEVER))
+    return Planted(a, b, _truth(("draw", "timing"), first=first, says=(r"delay",)))
 
 
 @fault("delay that only one run has")
@@ -132,7 +132,7 @@ def new_delay(rng: random.Random) -> Planted:
     topic = node.hears[0]
     b = changed(a, "delay", {"topics": {topic: "4ms"}})
     first = (r"4 ms", re.escape(topic))
-    return Planted(a, b, Truth(("draw", "timing"), first=first, says=(r"delay",), never=NEVER))
+    return Planted(a, b, _truth(("draw", "timing"), first=first, says=(r"delay",)))
 
 
 @fault("delay of all topics")
@@ -140,11 +140,7 @@ def default_delay(rng: random.Random) -> Planted:
     a = random_world(rng)
     a.job["delay"] = {"default": "1ms"}
     b = changed(a, "delay", {"default": "3ms"})
-    return Planted(
-        a,
-        b,
-        Truth(("draw", "timing"), first=(r"1 ms.* 3 ms",), says=(r"delay",), never=NEVER),
-    )
+    return Planted(a, b, _truth(("draw", "timing"), first=(r"1 ms.* 3 ms",), says=(r"delay",)))
 
 
 @fault("execution time")
@@ -156,13 +152,7 @@ def execution(rng: random.Random) -> Planted:
     return Planted(
         a,
         b,
-        Truth(
-            ("draw", "timing"),
-            node.full_name,
-            first=(r"1 ms.* 3 ms",),
-            says=(r"execution",),
-            never=NEVER,
-        ),
+        _truth(("draw", "timing"), node.full_name, first=(r"1 ms.* 3 ms",), says=(r"execution",)),
     )
 
 
@@ -173,15 +163,7 @@ def outage(rng: random.Random) -> Planted:
     outages = [{"node": node.full_name, "from": "100ms", "to": "200ms"}]
     a.job["delay"] = {"default": 0}
     b = changed(a, "delay", {"default": 0, "outages": outages})
-    return Planted(
-        a,
-        b,
-        Truth(
-            ("draw", "timing", "missing"),
-            says=(r"outage",),
-            never=NEVER,
-        ),
-    )
+    return Planted(a, b, _truth(("draw", "timing", "missing"), says=(r"outage",)))
 
 
 @fault("loss")
@@ -242,7 +224,7 @@ def _two_sources(rng: random.Random) -> tuple[World, NodePlan]:
 def policy(rng: random.Random) -> Planted:
     a, _ = _two_sources(rng)
     b = changed(a, "policy", {"priority": [{"node": "/twin", "priority": rng.randint(1, 9)}]})
-    return Planted(a, b, Truth(("schedule",), says=(r"policy",), never=NEVER, independent=None))
+    return Planted(a, b, _truth(("schedule",), says=(r"policy",), independent=None))
 
 
 @fault("order of the nodes")
@@ -250,11 +232,7 @@ def node_order(rng: random.Random) -> Planted:
     a, _ = _two_sources(rng)
     b = a.copy()
     b.job["nodes"].reverse()
-    return Planted(
-        a,
-        b,
-        Truth(("graph", "schedule"), says=(r"order",), never=NEVER, independent=None),
-    )
+    return Planted(a, b, _truth(("graph", "schedule"), says=(r"order",), independent=None))
 
 
 @fault("executors")
@@ -262,18 +240,14 @@ def executors(rng: random.Random) -> Planted:
     a, twin = _two_sources(rng)
     a.job["execution"] = {"nodes": {twin.full_name: "3ms", "/source0": "3ms"}}
     b = changed(a, "executors", "single_threaded")
-    return Planted(
-        a, b, Truth(("timing", "schedule"), says=(r"executors",), never=NEVER, independent=None)
-    )
+    return Planted(a, b, _truth(("timing", "schedule"), says=(r"executors",), independent=None))
 
 
 @fault("smallest time step")
 def time_step(rng: random.Random) -> Planted:
     a = random_world(rng)
     b = changed(a, "min_time_step", "61ms")
-    return Planted(
-        a, b, Truth(("timing",), says=(r"min_time_step",), never=NEVER, independent=None)
-    )
+    return Planted(a, b, _truth(("timing",), says=(r"min_time_step",), independent=None))
 
 
 @fault("start")
@@ -283,7 +257,7 @@ def start(rng: random.Random) -> Planted:
     a.nodes = [node for node in a.nodes if "/b0" not in node.hears]
     a.job["start"] = "0s"
     b = changed(a, "start", "1s")
-    return Planted(a, b, Truth(says=(r"\bstart\b",), never=NEVER, independent=None))
+    return Planted(a, b, _truth(says=(r"\bstart\b",), independent=None))
 
 
 @fault("clock of a node")
@@ -293,7 +267,7 @@ def clock(rng: random.Random) -> Planted:
     node.callbacks[0].lines.insert(1, "value = value + self.get_clock().now().nanoseconds * 1e-9")
     a.job["clocks"] = [{"node": node.full_name, "offset": "1ms"}]
     b = changed(a, "clocks", [{"node": node.full_name, "offset": "3ms"}])
-    return Planted(a, b, Truth(says=(r"clocks",), never=NEVER))
+    return Planted(a, b, _truth(says=(r"clocks",)))
 
 
 @fault("on_exception")
@@ -305,4 +279,4 @@ def on_exception(rng: random.Random) -> Planted:
     a.entry(node.name)["on_exception"] = "stop"
     b = a.copy()
     b.entry(node.name)["on_exception"] = "log"
-    return Planted(a, b, Truth(says=(r"on_exception",), never=NEVER, independent=None))
+    return Planted(a, b, _truth(says=(r"on_exception",), independent=None))

@@ -132,12 +132,7 @@ _in(
     ["accepted = False"],
     when="parameters[0].value == 1.0",
 )
-_in(
-    "pairs: stamp",
-    _pair(0, "tick"),
-    ["message.header.stamp.nanosec += 500"],
-    r"/left.*stamp",
-)
+_in("pairs: stamp", _pair(0, "tick"), ["message.header.stamp.nanosec += 500"], r"/left.*stamp")
 _in("pairs: left out", _pair(1, "tick"), ["return"], GONE)
 _in(
     "pairs: late",

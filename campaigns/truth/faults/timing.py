@@ -26,10 +26,7 @@ def _timed(
 
 _timed("timer reset after a sleep", ["time.sleep(0.003)", "self.timer.reset()"], "3 ms")
 _timed("timer cancelled and reset", ["self.timer.cancel()", "self.timer.reset()"])
-_timed(
-    "timer with another callback",
-    ["self.timer.callback = lambda: None"],
-)
+_timed("timer with another callback", ["self.timer.callback = lambda: None"])
 _timed("clock that was slept on", ["self.get_clock().sleep_for(Duration(seconds=0.002))"], "2 ms")
 _timed(
     "timer that is replaced",
@@ -65,11 +62,7 @@ def _in_setup(name: str, one: str, other: str, *says: str, mark: str = "create_t
 TIMER = "self.timer = self.create_timer({period}, self.tick)"
 MORE = "self.more = self.create_timer({period}, lambda: self.out.publish(Float64(data=-2.0)))"
 _in_setup("timer that does not start", TIMER, TIMER.replace("tick)", "tick, autostart=False)"))
-_in_setup(
-    "timers made in another order",
-    f"{TIMER}; {MORE}",
-    f"{MORE}; {TIMER}",
-)
+_in_setup("timers made in another order", f"{TIMER}; {MORE}", f"{MORE}; {TIMER}")
 _in_setup("callback of a timer", TIMER, TIMER.replace("self.tick", "lambda: None"))
 _in_setup(
     "timer that is made twice",

@@ -155,11 +155,7 @@ def another_exception(rng: random.Random, world: World) -> Change:
         "# before",
         f"if self.n == {at}: raise RuntimeError(text)",
     ]
-    truth = truth_of(
-        node,
-        verdicts=("exception", *OUTPUT),
-        says=(r"one way.*another way",),
-    )
+    truth = truth_of(node, verdicts=("exception", *OUTPUT), says=(r"one way.*another way",))
     return Change(node, ['text = "another way"'], truth, at=at)
 
 

@@ -12,11 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from rsltrace.adapters.launch import JobExpansion, ros_launch
-from rsltrace.adapters.launch.model import (
-    LaunchArgument,
-    LaunchResult,
-    argument_words,
-)
+from rsltrace.adapters.launch.model import LaunchArgument, LaunchResult, argument_words
 from rsltrace.adapters.launch.reader import ProgramNeededError, read_launch_file, shown_path
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.adapters.workspace.imports import unbuilt_packages

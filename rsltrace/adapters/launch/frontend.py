@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rsltrace.adapters.launch.api import actions, events, nodes, settings
+from rsltrace.adapters.launch.api.actions import AnyLaunchDescriptionSource
 from rsltrace.adapters.launch.api.basics import (
     Action,
     Condition,
@@ -19,7 +20,6 @@ from rsltrace.adapters.launch.api.basics import (
     Substitution,
     SubstitutionFailure,
 )
-from rsltrace.adapters.launch.api.description_sources import AnyLaunchDescriptionSource
 from rsltrace.adapters.launch.api.parameters import ParameterFile, ParameterValue
 from rsltrace.adapters.launch.model import Attribute, Element, truth, typed
 from rsltrace.adapters.launch.substitution import parse_template

@@ -29,16 +29,16 @@ from rsltrace.adapters.launch.api import (
     substitutions,
 )
 from rsltrace.adapters.launch.api import actions as conditions
-from rsltrace.adapters.launch.api import description_sources as sources
-from rsltrace.adapters.launch.api.actions import MissingModuleError
+from rsltrace.adapters.launch.api import actions as sources
+from rsltrace.adapters.launch.api.actions import (
+    MissingModuleError,
+    get_launch_description_from_python_launch_file,
+)
 from rsltrace.adapters.launch.api.basics import (
     LaunchContext,
     LaunchDescription,
     as_job_error,
     shown,
-)
-from rsltrace.adapters.launch.api.description_sources import (
-    get_launch_description_from_python_launch_file,
 )
 from rsltrace.adapters.launch.api.packages import missing_packages_allowed
 from rsltrace.adapters.launch.model import LaunchResult

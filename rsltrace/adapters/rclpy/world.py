@@ -20,20 +20,17 @@ from rsltrace.adapters.rclpy.concurrency.endless_waits import note_waits
 from rsltrace.adapters.rclpy.concurrency.entry_starts import ConstructionEvent, EntryStarts
 from rsltrace.adapters.rclpy.concurrency.line_switches import switches_at_lines
 from rsltrace.adapters.rclpy.concurrency.mains import begin_program, end_programs, own_exit_handlers
-from rsltrace.adapters.rclpy.concurrency.process_exit import (
-    own_process_ends,
-    own_signal_handlers,
-)
+from rsltrace.adapters.rclpy.concurrency.process_exit import own_process_ends, own_signal_handlers
 from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.concurrency.threads import cooperative_threads
 from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.executors.user_executors import note_replaced_functions, own_executors
 from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
+from rsltrace.adapters.rclpy.handles.node import Parameters, parameters_of
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
 from rsltrace.adapters.rclpy.hints import constructor_of, is_unmade
 from rsltrace.adapters.rclpy.node_clocks import ClockRule, NodeClocks
-from rsltrace.adapters.rclpy.parameters import Parameters, parameters_of
 from rsltrace.adapters.rclpy.terminals import Terminals, simulated_terminals
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.guard.redirect import replace_attribute

@@ -7,8 +7,13 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from rsltrace.checks.evaluate import UNDECIDED, VIOLATED, CheckResult, evaluate_checks
-from rsltrace.checks.functions import load_function
+from rsltrace.checks.evaluate import (
+    UNDECIDED,
+    VIOLATED,
+    CheckResult,
+    evaluate_checks,
+    load_function,
+)
 from rsltrace.checks.metrics import evaluate_metrics
 from rsltrace.checks.properties import Violation
 from rsltrace.job import Job

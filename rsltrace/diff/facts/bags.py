@@ -8,9 +8,9 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.diff.facts.evidence import FieldDifference, NoFieldsReason, Presence
 from rsltrace.diff.facts.remarks import Remark
+from rsltrace.diff.options import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.fast_dataclass import dataclass
 
 if TYPE_CHECKING:

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Any
 
-from rsltrace.diff.exit_codes import exit_code_of_several
 from rsltrace.diff.facts.bags import MessageDivergence
 from rsltrace.diff.facts.causes import Judgement, SameCause
 from rsltrace.diff.facts.evidence import (
@@ -25,6 +24,7 @@ from rsltrace.diff.facts.evidence import (
     MessageDifference,
     Setting,
 )
+from rsltrace.diff.options import exit_code_of_several
 from rsltrace.diff.result import BagDiff, Diff, Divergence
 from rsltrace.diff.sentences import sentence
 from rsltrace.diff.sentences.runs import order_text

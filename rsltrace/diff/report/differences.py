@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rsltrace.diff.facts.evidence import (
-    ULP_SHOWN_MAX,
-    FieldDifference,
-    MessageDifference,
-    Presence,
-)
+from rsltrace.diff.facts.evidence import ULP_SHOWN_MAX, FieldDifference, MessageDifference, Presence
 from rsltrace.diff.report.line import Line, Piece, Style, cut, in_columns, line, wrapped
 from rsltrace.diff.sentences.values import notes_text, output_change_text
 from rsltrace.trace.model.event import OutputKind

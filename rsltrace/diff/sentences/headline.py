@@ -22,13 +22,7 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.diff.sentences import sentence
 from rsltrace.diff.sentences.divergence import phrase, sentence_of
-from rsltrace.diff.sentences.values import (
-    IN_ONE,
-    field_text,
-    listed,
-    output_change_text,
-    pair_text,
-)
+from rsltrace.diff.sentences.values import IN_ONE, field_text, listed, output_change_text, pair_text
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.operation import PARAMETER_EVENTS
 from rsltrace.trace.model.texts import printable, shortened

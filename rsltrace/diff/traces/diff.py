@@ -12,8 +12,7 @@ from rsltrace.diff.alignment.divergence import first_difference
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.remarks import DifferentEnd, Identical, Repeats
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result import Diff, Reproduction
-from rsltrace.diff.traces.sides import side
+from rsltrace.diff.result import Diff, Reproduction, side
 from rsltrace.trace.native import is_native, refuse_native
 from rsltrace.trace.reader import Trace
 

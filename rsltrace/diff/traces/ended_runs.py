@@ -20,8 +20,7 @@ from rsltrace.diff.facts.causes import (
 from rsltrace.diff.facts.evidence import EventSummary, Setting
 from rsltrace.diff.facts.remarks import DifferentJobs, EndedByException, EqualUntilTruncated, Remark
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result import Diff
-from rsltrace.diff.traces.sides import interruptions, side, stop_reason
+from rsltrace.diff.result import Diff, interruptions, side, stop_reason
 from rsltrace.trace.format import REPLAY_DIVERGED
 from rsltrace.trace.model.event import EventFlag, EventKind, EventRecord
 from rsltrace.trace.model.texts import printable, shortened

@@ -27,8 +27,7 @@ from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.facts.remarks import LogTimesIgnored, NativeRuns
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result import Diff
-from rsltrace.diff.traces.sides import interruptions, side
+from rsltrace.diff.result import Diff, interruptions, side
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind

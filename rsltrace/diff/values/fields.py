@@ -26,13 +26,7 @@ from rsltrace.diff.values.numbers import (
     number_text,
     same_number,
 )
-from rsltrace.trace.model.texts import (
-    NS_PER_S,
-    PLACEHOLDERS,
-    format_seconds,
-    printable,
-    shortened,
-)
+from rsltrace.trace.model.texts import NS_PER_S, PLACEHOLDERS, format_seconds, printable, shortened
 
 WHOLE = "(whole)"
 """The path of a difference that belongs to no field: of the types, or of two plain values."""

@@ -286,11 +286,7 @@ _without: set[str] = set()
 class _TbbControl(ctypes.Structure):
     """TBB's ``global_control``: ``kind`` 0 limits the number of threads."""
 
-    _fields_ = (
-        ("value", ctypes.c_size_t),
-        ("next", ctypes.c_void_p),
-        ("kind", ctypes.c_int),
-    )
+    _fields_ = (("value", ctypes.c_size_t), ("next", ctypes.c_void_p), ("kind", ctypes.c_int))
 
 
 class _TbbThreads:

@@ -149,11 +149,7 @@ class _Loader(importlib.machinery.SourceFileLoader):
 class _ModuleFinder:
     """Finds user modules, and those of libraries, which have their own import time."""
 
-    def __init__(
-        self,
-        packages: frozenset[str],
-        rewrites: bool,
-    ) -> None:
+    def __init__(self, packages: frozenset[str], rewrites: bool) -> None:
         self._packages = packages
         self.rewrites = rewrites
 

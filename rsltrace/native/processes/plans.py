@@ -8,13 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 
-from rsltrace.adapters.processes.build import (
-    OBSERVER,
-    PreloadLibrary,
-    find_ros,
-    library,
-    program,
-)
+from rsltrace.adapters.processes.build import OBSERVER, PreloadLibrary, find_ros, library, program
 from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.errors import SetupError
 from rsltrace.job import Job, NodeSpec, locate

@@ -23,12 +23,7 @@ from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 from rsltrace.child_processes import how_ended
 from rsltrace.errors import JobError, RsltraceError, RunError
 from rsltrace.native.callback_observer import EXECUTORS
-from rsltrace.native.native_run import (
-    ENDS_WITHIN_S,
-    LOOK_EVERY_S,
-    NativeResult,
-    NativeRun,
-)
+from rsltrace.native.native_run import ENDS_WITHIN_S, LOOK_EVERY_S, NativeResult, NativeRun
 from rsltrace.native.processes.children import ObservedProcess, ProcessStart
 from rsltrace.native.processes.plans import start_rules, starts_of
 from rsltrace.native.processes.programs import ObservedProgram, variables_of

@@ -15,13 +15,7 @@ from rsltrace.replay.one_node.result import SENT, Column, RecordingColumns
 from rsltrace.simulation.loop.recorded_input_loop import NEVER, RecordedStep
 from rsltrace.trace.departures import Departures
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import (
-    NO_EVENT,
-    NO_SEQUENCE,
-    EventFlag,
-    EventKind,
-    OutputKind,
-)
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventFlag, EventKind, OutputKind
 
 # The entry of the job that made the node runs, with all that came from the same construction: an
 # entry may make several nodes, threads and timers. A trace says which event created each entity,

@@ -23,10 +23,7 @@ from rsltrace.adapters.processes.build import (
 )
 from rsltrace.adapters.rclpy.arguments import RosArguments
 from rsltrace.adapters.rclpy.entry import JobEntry
-from rsltrace.adapters.rclpy.messages.interfaces import (
-    get_message_class,
-    message_type,
-)
+from rsltrace.adapters.rclpy.messages.interfaces import get_message_class, message_type
 from rsltrace.adapters.rclpy.world import World
 from rsltrace.adapters.workspace.imports import unbuilt_names, unbuilt_prefix
 from rsltrace.errors import JobError, RunError, SetupError

@@ -56,9 +56,7 @@ from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.simulation.middleware.domain import Domain
-    from rsltrace.simulation.middleware.events.recorded_order_observer import (
-        RecordedOrderObserver,
-    )
+    from rsltrace.simulation.middleware.events.recorded_order_observer import RecordedOrderObserver
     from rsltrace.simulation.middleware.services import Client
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
@@ -75,9 +73,7 @@ def follow_recording(
 
     :raises JobError: the recording cannot be read, or has no events.
     """
-    from rsltrace.simulation.middleware.events.recorded_order_observer import (
-        RecordedOrderObserver,
-    )
+    from rsltrace.simulation.middleware.events.recorded_order_observer import RecordedOrderObserver
 
     if job.policy is None or job.policy.recorded is None:
         return None

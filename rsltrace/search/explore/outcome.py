@@ -9,17 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rsltrace.checks.evaluate import VIOLATED, CheckResult, evaluate_checks
-from rsltrace.checks.functions import load_function
+from rsltrace.checks.evaluate import VIOLATED, CheckResult, evaluate_checks, load_function
 from rsltrace.checks.metrics import evaluate_metrics
-from rsltrace.errors import (
-    CheckError,
-    DeadlockError,
-    JobError,
-    LivelockError,
-    NodeError,
-    RunError,
-)
+from rsltrace.errors import CheckError, DeadlockError, JobError, LivelockError, NodeError, RunError
 from rsltrace.job import Job
 from rsltrace.run.process import preserved_process, search_path
 from rsltrace.run.session import RunResult, RunSession

@@ -13,7 +13,7 @@ from math import sqrt
 from typing import TYPE_CHECKING, Protocol, cast
 
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.simulation.chance.portable_math import exp, log
+from rsltrace.simulation.chance.stream import exp, log
 
 if TYPE_CHECKING:
     from rsltrace.simulation.chance.stream import RandomStream

@@ -192,9 +192,7 @@ def _of(node: Participant, ends: dict[str, list[EndT]]) -> list[EndT]:
     return [end for named in ends.values() for end in named if end.node is node]
 
 
-def action_names_and_types(
-    topics: list[tuple[str, list[str]]],
-) -> list[tuple[str, list[str]]]:
+def action_names_and_types(topics: list[tuple[str, list[str]]]) -> list[tuple[str, list[str]]]:
     """Return the actions among topics: rcl finds them by their feedback topics, too."""
     name_end, type_end = "/_action/feedback", "_FeedbackMessage"
     return [

@@ -40,8 +40,7 @@ from rsltrace.trace.mcap.records import (
 )
 from rsltrace.trace.mcap.source import ByteSource, FileSource
 from rsltrace.trace.model.texts import format_seconds
-from rsltrace.trace.recordings.merge import BagMessage
-from rsltrace.trace.recordings.topic import Extent, StoredTopic, parse_qos
+from rsltrace.trace.recordings.topic import BagMessage, Extent, StoredTopic, parse_qos
 
 # Messages outside chunks are gathered into runs, and read like chunks.
 

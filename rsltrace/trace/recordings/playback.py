@@ -10,8 +10,8 @@ from itertools import count
 
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.chunk import PUBLISH_TIME_BYTES
-from rsltrace.trace.recordings.merge import BagMessage
 from rsltrace.trace.recordings.reader import Bag
+from rsltrace.trace.recordings.topic import BagMessage
 
 BY_LOG_TIME = "log_time"
 BY_PUBLISH_TIME = "publish_time"

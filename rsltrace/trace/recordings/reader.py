@@ -21,11 +21,19 @@ from rsltrace.trace.mcap.records import MAGIC as MCAP_MAGIC
 from rsltrace.trace.model.regular_file import not_regular
 from rsltrace.trace.model.texts import format_duration, format_seconds
 from rsltrace.trace.recordings.mcap_file import McapFile
-from rsltrace.trace.recordings.merge import BagMessage, RecordingPart, merge
 from rsltrace.trace.recordings.metadata import NAME, read_metadata
 from rsltrace.trace.recordings.sqlite_file import MAGIC as SQLITE_MAGIC
 from rsltrace.trace.recordings.sqlite_file import SqliteFile
-from rsltrace.trace.recordings.topic import BagQos, BagTopic, Extent, Storage, StoredTopic
+from rsltrace.trace.recordings.topic import (
+    BagMessage,
+    BagQos,
+    BagTopic,
+    Extent,
+    RecordingPart,
+    Storage,
+    StoredTopic,
+    merge,
+)
 
 # Recovery of a truncated database: its readable rows are copied into a new one, in the order they
 # were written, so the end of the recording is lost.

@@ -13,8 +13,7 @@ from typing import Any
 from urllib.parse import quote
 
 from rsltrace.errors import BagError
-from rsltrace.trace.recordings.merge import BagMessage
-from rsltrace.trace.recordings.topic import Extent, StoredTopic, parse_qos
+from rsltrace.trace.recordings.topic import BagMessage, Extent, StoredTopic, parse_qos
 
 MAGIC = b"SQLite format 3\0"
 _HEADER_BYTES = 100

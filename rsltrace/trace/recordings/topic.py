@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from heapq import heappop, heappush
 from typing import Any, Protocol
 
 from rsltrace.trace.model.operation import nested_too_deep
 from rsltrace.trace.model.texts import NS_PER_S, yaml_problem
-from rsltrace.trace.recordings.merge import BagMessage
 
 DURATION_INFINITE_NS = 2**63 - 1
 """An infinite QoS duration in ROS 2."""
@@ -202,3 +202,56 @@ class Storage(Protocol):
 
     def close(self) -> None:
         """Close the file."""
+
+
+# Merge many parts of a recording into one stream of messages by time, with few in memory.
+#
+# The time span of a part (a chunk, a database) is known before it is read, so it is opened only
+# when the stream reaches its start, and dropped at its end.
+
+BagMessage = tuple[int, int, bytes]
+"""Log time in nanoseconds, index of the topic, CDR bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingPart:
+    """A part of a recording. ``order`` is its unique position in the recording.
+
+    ``read`` yields its messages by time (equal times in file order), none before ``start_ns``.
+    """
+
+    start_ns: int
+    order: int
+    read: Callable[[], Iterator[BagMessage]]
+
+
+def merge(pieces: Iterable[RecordingPart]) -> Iterator[BagMessage]:
+    """Yield the messages of all parts by (time, order of the part, position in it)."""
+    waiting = sorted(pieces, key=lambda piece: (piece.start_ns, piece.order), reverse=True)
+    # The order is unique, so comparisons end there.
+    opened: list[tuple[int, int, BagMessage, Iterator[BagMessage]]] = []
+    while waiting or opened:
+        while waiting and (not opened or (waiting[-1].start_ns, waiting[-1].order) < opened[0][:2]):
+            piece = waiting.pop()
+            rest = piece.read()
+            first = next(rest, None)
+            if first is not None:
+                heappush(opened, (first[0], piece.order, first, rest))
+        if not opened:
+            continue
+        _, order, message, rest = heappop(opened)
+        # Usually one part is open: continue it up to where another may come first.
+        limits = [entry[:2] for entry in opened[:1]]
+        limits += [(piece.start_ns, piece.order) for piece in waiting[-1:]]
+        yield message
+        if not limits:
+            yield from rest
+            continue
+        limit_ns, limit_order = min(limits)
+        for message in rest:
+            stamp_ns = message[0]
+            if stamp_ns < limit_ns or (stamp_ns == limit_ns and order < limit_order):
+                yield message
+            else:
+                heappush(opened, (stamp_ns, order, message, rest))
+                break

@@ -15,12 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from rsltrace.adapters.launch.api.basics import (
-    NOWHERE,
-    WHY,
-    LaunchContext,
-    calling_line,
-)
+from rsltrace.adapters.launch.api.basics import NOWHERE, WHY, LaunchContext, calling_line
 from rsltrace.job.reading.substitute import package_prefix
 
 _ASKED = ("get_package_share_directory", "get_package_share_path", "get_package_prefix")

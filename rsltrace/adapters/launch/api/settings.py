@@ -6,12 +6,7 @@ import os
 from collections.abc import Iterable
 from typing import Any
 
-from rsltrace.adapters.launch.api.basics import (
-    Action,
-    LaunchContext,
-    as_substitutions,
-    visit_all,
-)
+from rsltrace.adapters.launch.api.basics import Action, LaunchContext, as_substitutions, visit_all
 from rsltrace.adapters.launch.api.parameters import ParameterFile, plain_value
 from rsltrace.adapters.launch.model import (
     ENVIRONMENT,

@@ -13,7 +13,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from rsltrace.adapters.rclpy.arguments import (
+    LEVELS,
     InvalidArgumentsError,
+    LogLevels,
     RosArguments,
     UnknownArgumentsError,
 )
@@ -40,7 +42,6 @@ from rsltrace.adapters.rclpy.handles.services import (
 )
 from rsltrace.adapters.rclpy.handles.timers import GuardConditionHandle, RosTimerHandle, TimerHandle
 from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
-from rsltrace.adapters.rclpy.log_levels import LEVELS, LogLevels
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.names import (
     expand,

@@ -12,11 +12,7 @@ from rsltrace.adapters.rclpy.concurrency.coroutines import ResumeTask
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.concurrency.tasks import create_task
 from rsltrace.adapters.rclpy.executors.user_executors import is_bookkeeping
-from rsltrace.adapters.rclpy.handles.wait_set import (
-    activate_node,
-    deactivate_node,
-    sync_woken,
-)
+from rsltrace.adapters.rclpy.handles.wait_set import activate_node, deactivate_node, sync_woken
 from rsltrace.trace.model.texts import waiting_ns
 
 

@@ -25,7 +25,7 @@ from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
-    from rsltrace.trace.leaves import ValueField
+    from rsltrace.trace.decode import ValueField
 
 
 _KINDS = ("change", "change", "change", "change", "swap", "repeat")

@@ -9,11 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
-from rsltrace.simulation.loop.recorded_order import (
-    RecordedEvent,
-    RecordedOrder,
-    event_text,
-)
+from rsltrace.simulation.loop.recorded_order import RecordedEvent, RecordedOrder, event_text
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
