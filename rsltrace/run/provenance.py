@@ -88,6 +88,7 @@ def _numpy_kernels() -> str:
     return " ".join(["numpy", *filter(core.__cpu_features__.get, core.__cpu_dispatch__)])
 
 
+@lru_cache(maxsize=1)
 def _math_functions() -> str:
     """Return the C library's version, and a checksum of what its functions give: they round by the
     instructions of the processor."""
