@@ -253,16 +253,17 @@ class SourceHashes:
 
     def __init__(self, writer: TraceWriter, files: Mapping[str, Path]) -> None:
         self._writer = writer
-        self._files = dict(files)
-        self._hashes = {name: _file_hash(path) for name, path in files.items()}
+        self._files: dict[str, Path] = {}
+        self._hashes: dict[str, str] = {}
         self._late: set[str] = set()
-        self._write()
+        self._written: set[str] | None = None
+        self.add(files)
 
     def add(self, files: Mapping[str, Path], *, late: bool = False) -> None:
         """Add the files that are new. ``late``: callbacks have loaded them, which they may do in
         one run and not in another of the same code."""
         for name in files.keys() - self._files.keys():
-            with suppress(OSError):  # it has been removed since
+            with suppress(OSError):  # it has been removed since, or is in an archive
                 self._hashes[name] = _file_hash(files[name])
                 self._files[name] = files[name]
                 self._late |= {name} if late else set()
