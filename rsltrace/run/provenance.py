@@ -257,7 +257,14 @@ class SourceHashes:
         self._hashes: dict[str, str] = {}
         self._late: set[str] = set()
         self._written: set[str] | None = None
+        self._loaded = _loaded_names()
         self.add(files)
+
+    def add_loaded(self, job: Job, *, late: bool = False) -> None:
+        """Add the modules of a job that have been loaded since."""
+        if (loaded := _loaded_names()) != self._loaded:  # to look at all their files takes long
+            self._loaded = loaded
+            self.add(loaded_modules(job), late=late)
 
     def add(self, files: Mapping[str, Path], *, late: bool = False) -> None:
         """Add the files that are new. ``late``: callbacks have loaded them, which they may do in
@@ -275,6 +282,10 @@ class SourceHashes:
         self._writer.add_metadata(METADATA_SOURCES, self._hashes)
         if code := module_code(self._files, self._late):
             self._writer.add_metadata(METADATA_CODE, code)
+
+
+def _loaded_names() -> set[str]:
+    return sys.modules.keys() | COPIED_FILES.keys()
 
 
 def _file_hash(path: Path) -> str:
