@@ -1208,8 +1208,7 @@ static int is_first(TimerQueue *queue, TimerState *state) {
 
 /* Returns the time after a call (TimerState.call). */
 static PyObject *next_deadline(int64_t now, int64_t deadline, int64_t period) {
-  if (period <= 0)
-    period = 1000000; /* ZERO_PERIOD_NS */
+  if (period <= 0) period = 1000000; /* ZERO_PERIOD_NS */
   deadline += period;
   if (deadline <= now)
     deadline += (1 + (now - deadline) / period) * period;

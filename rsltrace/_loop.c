@@ -252,7 +252,8 @@ static PyObject *loop_run_arrivals(WholeLoop *self, PyObject *now_ns) {
   int failed = 0;
   Py_INCREF(now_ns);
   while (!failed && item != NULL && item != Py_False) {
-    failed = set(&now_ns, Py_XNewRef(self->of_events.now_ns)) < 0 ||
+    failed = !HAS_FIELD(self, Loop, loop, now_ns) ||
+             set(&now_ns, Py_NewRef(self->of_events.now_ns)) < 0 ||
              (item != Py_None && dispatch(item) < 0);
     Py_DECREF(item);
     item = failed ? NULL : loop_next_arrival(self, NULL);

@@ -88,6 +88,7 @@ def _numpy_kernels() -> str:
     return " ".join(["numpy", *filter(core.__cpu_features__.get, core.__cpu_dispatch__)])
 
 
+@lru_cache(maxsize=1)
 def _math_functions() -> str:
     """Return the C library's version, and a checksum of what its functions give: they round by the
     instructions of the processor."""
@@ -252,16 +253,24 @@ class SourceHashes:
 
     def __init__(self, writer: TraceWriter, files: Mapping[str, Path]) -> None:
         self._writer = writer
-        self._files = dict(files)
-        self._hashes = {name: _file_hash(path) for name, path in files.items()}
+        self._files: dict[str, Path] = {}
+        self._hashes: dict[str, str] = {}
         self._late: set[str] = set()
-        self._write()
+        self._written: set[str] | None = None
+        self._loaded = _loaded_names()
+        self.add(files)
+
+    def add_loaded(self, job: Job, *, late: bool = False) -> None:
+        """Add the modules of a job that have been loaded since."""
+        if (loaded := _loaded_names()) != self._loaded:  # to look at all their files takes long
+            self._loaded = loaded
+            self.add(loaded_modules(job), late=late)
 
     def add(self, files: Mapping[str, Path], *, late: bool = False) -> None:
         """Add the files that are new. ``late``: callbacks have loaded them, which they may do in
         one run and not in another of the same code."""
         for name in files.keys() - self._files.keys():
-            with suppress(OSError):  # it has been removed since
+            with suppress(OSError):  # it has been removed since, or is in an archive
                 self._hashes[name] = _file_hash(files[name])
                 self._files[name] = files[name]
                 self._late |= {name} if late else set()
@@ -273,6 +282,10 @@ class SourceHashes:
         self._writer.add_metadata(METADATA_SOURCES, self._hashes)
         if code := module_code(self._files, self._late):
             self._writer.add_metadata(METADATA_CODE, code)
+
+
+def _loaded_names() -> set[str]:
+    return sys.modules.keys() | COPIED_FILES.keys()
 
 
 def _file_hash(path: Path) -> str:

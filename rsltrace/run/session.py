@@ -59,7 +59,6 @@ from rsltrace.run.provenance import (
     LateLibraryScan,
     SourceHashes,
     environment,
-    loaded_modules,
     payload_filter,
     source_files,
     write_job,
@@ -443,7 +442,7 @@ class RunSession:
 
     def _add_sources(self, *, late: bool = False) -> None:
         if self._sources is not None:
-            self._sources.add(loaded_modules(self.job), late=late)
+            self._sources.add_loaded(self.job, late=late)
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. Failures are in ``error``."""

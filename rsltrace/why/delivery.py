@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
 
+from rsltrace.simulation.loop.timer_queue import ZERO_PERIOD_NS
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import OutputKind, decision_text, encode_decision
@@ -349,4 +350,4 @@ class TimerLate:
         if question.at_ns is not None:
             gaps = [gap for gap in gaps if gap[0] <= question.at_ns][-1:]
         from_ns, to_ns = max(gaps, key=lambda gap: gap[1] - gap[0], default=(0, 0))
-        return Busy.between(question, from_ns + period_ns, to_ns)
+        return Busy.between(question, from_ns + (period_ns or ZERO_PERIOD_NS), to_ns)

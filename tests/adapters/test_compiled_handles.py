@@ -22,6 +22,7 @@ from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, Subscription
 from rsltrace.adapters.rclpy.handles.timers import TimerHandle
 from rsltrace.compiled import core
 from rsltrace.errors import RunError
+from rsltrace.simulation.loop.loop import EventLoop
 
 pytestmark = [
     pytest.mark.ros,
@@ -90,10 +91,21 @@ class Changes(Node):
         gc.collect()
 
 
-def in_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(SubscriptionHandle, "dispatch", SubscriptionHandle.dispatch_any)
+def in_python(monkeypatch: pytest.MonkeyPatch) -> list[SubscriptionHandle]:
+    """Leave the compiled methods; return the subscriptions that are dispatched without them."""
+    dispatched: list[SubscriptionHandle] = []
+
+    def dispatch(handle: SubscriptionHandle) -> None:
+        dispatched.append(handle)
+        handle.dispatch_any()
+
+    # A compiled loop does not look up a method of a class that it knows.
+    monkeypatch.setattr(EventLoop, "run_ready", EventLoop.python_run_ready)
+    monkeypatch.setattr(EventLoop, "run_arrivals", EventLoop.python_run_arrivals)
+    monkeypatch.setattr(SubscriptionHandle, "dispatch", dispatch)
     monkeypatch.setattr(PublisherHandle, "publish", PublisherHandle.publish_any)
     monkeypatch.setattr(TimerHandle, "dispatch", TimerHandle.dispatch_any)
+    return dispatched
 
 
 class ChangesTimers(Node):
@@ -191,8 +203,9 @@ def test_callbacks_run_the_same(
 
     compiled = run()
     assert expected <= {entry[0] for entry in compiled[0] if isinstance(entry, tuple)}
-    in_python(monkeypatch)
+    dispatched = in_python(monkeypatch)
     assert run() == compiled
+    assert bool(dispatched) is (kind is Changes)
 
 
 @pytest.mark.parametrize(
@@ -224,8 +237,9 @@ def test_what_a_callback_raises_ends_the_run_the_same(
         return result.digest, result.exit_code, type(error.__context__)
 
     compiled = run()
-    in_python(monkeypatch)
+    dispatched = in_python(monkeypatch)
     assert run() == compiled
+    assert dispatched
     assert compiled[-1] is KeyError
 
 

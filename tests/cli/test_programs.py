@@ -252,6 +252,10 @@ def test_flaky_calls_a_test_that_passes_at_times_flaky(workspace: Path, command:
     assert done.returncode == 1
     assert "it failed in 6 of 8 runs" in done.stdout
     assert "not flaky" not in done.stdout
+    words = ("flaky", "--force", "--stop-at-first", "--jobs", "1", "-q", "--")
+    done = command(*words, "pytest", "-q", "test_late.py")
+    assert "it failed in 1 of 1 run" in done.stdout
+    assert "not flaky" not in done.stdout
 
 
 @pytest.mark.ros
@@ -268,7 +272,7 @@ def test_flaky_says_that_a_test_never_failed(workspace: Path, command: Command) 
     text = _RACE.replace("order() == [0, 1]", "not order()")
     (workspace / "test_wrong.py").write_text(text)
     done = command(
-        "flaky", "--budget", "1", "--jobs", "1", "-q", "--", "pytest", "-q", "test_wrong.py"
+        "flaky", "--budget", "2", "--jobs", "1", "-q", "--", "pytest", "-q", "test_wrong.py"
     )
     assert done.returncode == 1
     assert done.stdout.splitlines()[1] == "it never passed, so it is not flaky"

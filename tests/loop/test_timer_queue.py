@@ -54,6 +54,10 @@ def test_a_timer_without_period_is_due_at_once_and_then_every_millisecond() -> N
     assert state.deadline_ns == ZERO_PERIOD_NS
     state.call(ZERO_PERIOD_NS)
     assert state.deadline_ns == 2 * ZERO_PERIOD_NS
+    state.reset(ZERO_PERIOD_NS)  # in its callback: not again at the same instant
+    assert state.deadline_ns == 2 * ZERO_PERIOD_NS
+    state.reset(9 * ZERO_PERIOD_NS)
+    assert state.deadline_ns == 9 * ZERO_PERIOD_NS
 
 
 def test_a_negative_period_is_refused() -> None:

@@ -431,6 +431,30 @@ def test_a_broken_link_or_loop_is_refused() -> None:
         run.loop.run_ready(9)
 
 
+@needs_core
+def test_an_arrival_that_takes_the_time_away_is_an_error() -> None:
+    run = DelayedRun(4, compiled=True)
+    loop: Any = run.loop
+    loop.scheduled.clear()
+
+    class Ready(deque[Any]):
+        def popleft(self) -> Any:
+            del loop.now_ns
+            return super().popleft()
+
+    def arrives(release: object) -> None:
+        loop.ready = Ready([run.subscriptions[0]])
+
+    loop.tasks.clear()
+    loop.ready.clear()
+    loop._until_events, loop._quiet_ns, loop.min_step_ns = 1000, 2**63, 0
+    loop.schedule(loop.now_ns + 1, lambda: None)
+    ((at_ns, order, place, *_),) = loop.scheduled
+    loop.scheduled[:] = [(at_ns, order, place, arrives)]
+    with pytest.raises(AttributeError, match="now_ns"):
+        loop.run_arrivals(0)
+
+
 @pytest.mark.parametrize(
     ("args", "name"), [((), "call_back"), ((1,), "call_back_with"), ((1, 2), "call_back")]
 )

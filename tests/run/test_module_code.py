@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.run.provenance import module_code
+from rsltrace.run.provenance import SourceHashes, module_code
+from rsltrace.trace.format import METADATA_SOURCES
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.writer import TraceWriter
 
 CODE = 'import pkg.gains\n\n\ndef go(x):\n    """Go."""\n    return [x, 1.5]\n'
 
@@ -78,3 +81,14 @@ def test_what_is_not_python_is_left_out(tmp_path: Path) -> None:
         files[name].write_text(text)
     files["gone"] = tmp_path / "gone.py"
     assert list(module_code(files)) == ["odd.py"]
+
+
+def test_a_file_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
+    """As of a module in an archive, or one that is gone since Python has loaded it."""
+    (tmp_path / "node.py").write_text(CODE)
+    (tmp_path / "lib.zip").touch()
+    files = {name: tmp_path / name for name in ("node.py", "lib.zip/inside.py", "gone.py")}
+    with TraceWriter(tmp_path / "a.mcap", force=False) as writer:
+        SourceHashes(writer, files)
+    with Trace.open(tmp_path / "a.mcap") as trace:
+        assert [*trace.metadata(METADATA_SOURCES)] == ["node.py"]

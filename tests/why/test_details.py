@@ -112,6 +112,27 @@ def test_a_callback_that_waited_for_several(
         )
 
 
+@pytest.mark.ros
+def test_a_timer_of_period_0_is_not_late_every_millisecond(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "restless.py").write_text(
+        "from rclpy.node import Node\n"
+        "class Restless(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('restless')\n"
+        "        self.create_timer(0.0, self.tick)\n"
+        "    def tick(self): pass\n"
+    )
+    (tmp_path / "job.yaml").write_text(
+        "nodes: [{node: restless:Restless}]\nexecution: {default: 10us}\nstop: {duration: 5ms}\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    run(load_job("job.yaml"), "run.mcap")
+    with Trace.open("run.mcap") as trace:
+        assert "ran as expected, 6 times" in why(trace, "/restless", "tick").words()
+
+
 _FIB = """
 from example_interfaces.action import Fibonacci
 from rclpy.action import ActionClient, ActionServer

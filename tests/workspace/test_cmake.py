@@ -194,8 +194,9 @@ _TRIPLED = 'set(a "${a}${a}${a}")\n' * 40
         "if(TRUE)\n" * 2000 + "endif()\n" * 2000,
         f"if({'NOT ' * 5000}TRUE)\nendif()\n",
         f'if("{"a" * 40}" MATCHES "(a+)+b")\nendif()\n',
+        f'if("{"a" * 40}" MATCHES "{"a?" * 40}{"a" * 40}")\nendif()\n',
     ],
-    ids=["tripled", "appended", "replaced", "nested", "negated", "matched"],
+    ids=["tripled", "appended", "replaced", "nested", "negated", "matched", "optional"],
 )
 def test_small_files_that_mean_enormous_ones_end(package: SourcePackage, text: str) -> None:
     text = f"set(a aaaaaaaaaaaaaaaaaaaa)\ncalled(first)\n{text}"

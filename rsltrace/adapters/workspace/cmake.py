@@ -577,7 +577,7 @@ def _end_of(calls: Sequence[_WrittenCommand], index: int, name: str) -> int:
 def _pattern(text: str) -> re.Pattern[str] | None:
     """Return one of CMake's regular expressions, None if Python has none of that kind, or if it
     may take for ever: it repeats groups, or much."""
-    if re.search(r"\)[*+?{]", text) or len(re.findall(r"[*+]", text)) > 3:
+    if re.search(r"\)[*+?{]", text) or len(re.findall(r"[*+?{]", text)) > 3:
         return None
     try:
         return re.compile(text)

@@ -176,7 +176,8 @@ def flaky_lines(
     failed = sum(tally.failures.values())
     yield f"it failed in {failed} of {runs}" if failed else f"it never failed in {runs}"
     if failed and failed == tally.runs:
-        yield "it never passed, so it is not flaky"
+        if failed > 1:  # the only run says nothing of others: --stop-at-first
+            yield "it never passed, so it is not flaky"
         yield _EXACT_TIME
     for key in _by_frequency(tally)[:_CAUSES_MAX]:
         failure, count, one = tally.first[key].failure, tally.failures[key], small.get(key)

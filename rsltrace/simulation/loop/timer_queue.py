@@ -53,7 +53,8 @@ class TimerState(TimerStateFields):
 
     def reset(self, now_ns: int) -> None:
         """Start a new grid at ``now_ns``; a cancelled timer runs again."""
-        self.deadline_ns = now_ns + self.period_ns
+        soonest_ns = max(now_ns, min(self.deadline_ns, now_ns + ZERO_PERIOD_NS))
+        self.deadline_ns = now_ns + self.period_ns if self.period_ns else soonest_ns
         self.canceled = False
 
 

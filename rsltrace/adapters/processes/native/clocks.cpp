@@ -127,9 +127,7 @@ RSLTRACE_EXPORT time_t time(time_t *out) noexcept {
 }
 
 RSLTRACE_EXPORT int ftime(timeb *out) {
-  using Function = int(timeb *);
-  static auto *libc = reinterpret_cast<Function *>(real("ftime"));  // REAL: its header warns of it
-  if (!linked()) return libc(out);
+  if (!linked()) return reinterpret_cast<int (*)(timeb *)>(real("ftime"))(out);  // REAL: its header warns of it
   timespec now;
   clock_gettime(CLOCK_REALTIME, &now);
   *out = {now.tv_sec, static_cast<unsigned short>(now.tv_nsec / 1'000'000), 0, 0};
