@@ -30,8 +30,8 @@ _HEAD = """\
 
 <!-- Made by `make docs` from the models in rsltrace/job; do not edit. -->
 
-`rsltrace init` writes a first job, `rsltrace check job.yaml` checks it without running it. A rule for
-a topic, service, node or parameter that does not exist is a note.
+`rsltrace init` writes a first job, `rsltrace check job.yaml` checks it without running it. A rule
+for a topic, service, node or parameter that does not exist is a note.
 
 - **Times** are seconds (`0.5`), or a number with a unit: `ns`, `us`, `ms`, `s`, `min` or `h`.
 - **Sizes** are bytes, or a number with a unit: `500kB`, `4MiB`.
