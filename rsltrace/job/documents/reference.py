@@ -30,14 +30,12 @@ _HEAD = """\
 
 <!-- Made by `make docs` from the models in rsltrace/job; do not edit. -->
 
-A job file is YAML. `rsltrace init` writes a first one, `rsltrace check job.yaml` checks it without
-running it. A mistake is an error with file, line, column and what was expected. A rule for a topic,
-service, node or parameter that does not exist is a note.
+`rsltrace init` writes a first job, `rsltrace check job.yaml` checks it without running it. A rule
+for a topic, service, node or parameter that does not exist is a note.
 
 - **Times** are seconds (`0.5`), or a number with a unit: `ns`, `us`, `ms`, `s`, `min` or `h`.
 - **Sizes** are bytes, or a number with a unit: `500kB`, `4MiB`.
-- **Paths** are relative to their file.
-- **Globs** match whole names; `*` also matches `/`.
+- **Paths** are relative to their file. **Globs** match whole names; `*` also matches `/`.
 - **YAML anchors** work. Keys that begin with `x-` are ignored and may hold them.
 - **Editors** complete and check job files: run `rsltrace schema > job.schema.json`, and begin the
   job with `# yaml-language-server: $schema=job.schema.json`.
@@ -46,7 +44,7 @@ service, node or parameter that does not exist is a note.
   `--set bags.+=../bag` (a new entry), `--set stop.events=null` (no such key). The value is YAML.
   Quote names with a dot. Later ones win.
 
-A type is named only where the example does not show it.
+Types, and keys of short mappings, are named only where the example does not show them.
 """
 
 
@@ -61,6 +59,8 @@ def reference() -> str:
         if model in done:
             continue
         fields = list(file_fields(model))
+        if all(field.is_required() for _, field in fields):
+            continue  # the example of its key shows all that it has
         out += _section(f"`{path}`", model, fields, done)
         done[model] = path
         queue = [*_parts(fields, path), *queue]

@@ -128,11 +128,13 @@ class ClockSpec(JobPart):
         examples=["50ppm"],
     )
     jumps: Annotated[tuple[JumpSpec, ...], parts()] = Field(
-        default=(), description="When it jumps.", examples=[[{"at": "5s", "by": "100ms"}]]
+        default=(),
+        description="When it jumps; by a negative time: backwards.",
+        examples=[[{"at": "5s", "by": "100ms"}]],
     )
     random_jumps: Annotated[RandomJumpsSpec | None, given] = Field(
         default=None,
-        description="Jumps at random times.",
+        description="Jumps at random times (Poisson) of random size (uniform, either way).",
         examples=[{"every": "10s", "most": "50ms"}],
     )
 

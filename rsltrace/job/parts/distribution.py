@@ -255,12 +255,12 @@ class DistributionSpec(JobPart):
     )
     uniform: Annotated[UniformSpec | None, given] = Field(
         default=None,
-        description="Uniform.",
+        description="Uniform, bounds included.",
         examples=[{"min": "1ms", "max": "3ms"}],
     )
     normal: Annotated[NormalSpec | None, given] = Field(
         default=None,
-        description="Normal, truncated at zero.",
+        description="Normal; negative values are drawn again.",
         examples=[{"mean": "5ms", "sd": "1ms"}],
     )
     lognormal: Annotated[LognormalSpec | None, given] = Field(
