@@ -6,6 +6,7 @@ this has not yet is a field there (``events.py``).
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
@@ -273,13 +274,21 @@ class ShortNames:
     def _cut(self, width: int) -> dict[str, str]:
         """Return the cut form of all names that are longer than ``width``."""
         chosen: dict[str, str] = {}
-        for cut in (fit, _in_the_middle, _at_the_start):
+        for cut in (fit, _in_the_middle, _at_the_start, self._where_it_differs):
             forms = {name: cut(name, width) for name in self._names}
             count = Counter(forms.values())
             for name, form in forms.items():
                 if cells(name) > width and name not in chosen and count[form] == 1:
                     chosen[name] = form
         return chosen
+
+    def _where_it_differs(self, name: str, width: int) -> str:
+        """Show where the name begins to differ from those before and after it."""
+        at = self._names.index(name)
+        beside = self._names[max(at - 1, 0) : at] + self._names[at + 1 : at + 2]
+        alike = max((len(os.path.commonprefix([name, other])) for other in beside), default=0)
+        begin = max(alike - width // 3, 0)
+        return fit("…" + name[begin:] if begin else name, width)
 
 
 def _in_the_middle(name: str, width: int) -> str:
