@@ -6,10 +6,10 @@ this has not yet is a field there (``events.py``).
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
+from itertools import takewhile
 
 from rich.cells import set_cell_size
 
@@ -286,9 +286,13 @@ class ShortNames:
         """Show where the name begins to differ from those before and after it."""
         at = self._names.index(name)
         beside = self._names[max(at - 1, 0) : at] + self._names[at + 1 : at + 2]
-        alike = max((len(os.path.commonprefix([name, other])) for other in beside), default=0)
-        begin = max(alike - width // 3, 0)
-        return fit("…" + name[begin:] if begin else name, width)
+        begin = max((_alike(name, other) for other in beside), default=0) - width // 3
+        return fit("…" + name[begin:] if begin > 0 else name, width)
+
+
+def _alike(a: str, b: str) -> int:
+    """Return how many characters two names begin with in common."""
+    return sum(1 for _ in takewhile(lambda both: both[0] == both[1], zip(a, b, strict=False)))
 
 
 def _in_the_middle(name: str, width: int) -> str:
