@@ -239,7 +239,7 @@ class JobArguments:
                 spec["skip_unsupported"] = True
             changes.append(("--launch", f"launch.+={json.dumps(spec, ensure_ascii=False)}"))
         words = self._ros_with(lambda path: os.path.relpath(path, named.parent))
-        changes += [f"ros_arguments.+={json.dumps(word)}" for word in words]
+        changes += [("--ros-args", f"ros_arguments.+={json.dumps(word)}") for word in words]
         return named, changes, None if files else "{}"
 
     def source_name(self, named: Path) -> str:

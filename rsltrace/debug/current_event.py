@@ -12,6 +12,7 @@ from types import CodeType, FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rsltrace.adapters.rclpy.concurrency.coroutines import TaskRun
+from rsltrace.adapters.rclpy.concurrency.threads import SimThread
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 from rsltrace.conditions.view import SentOutput
@@ -226,6 +227,9 @@ class CurrentEventView:
 def call_of(callback: Any, args: tuple[Any, ...]) -> CallbackCall:
     """Return the user function that an event calls; a task calls a coroutine."""
     task = getattr(callback, "__self__", None)
+    if isinstance(task, SimThread) and task.thread is not None:
+        thread: Any = task.thread
+        return CallbackCall(getattr(thread, "_target", None) or thread.run, ())
     return (
         CallbackCall(*task.called, task)
         if isinstance(task, TaskRun)

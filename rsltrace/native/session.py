@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.rclpy.boundary.installation import check_no_simulation, native_extension
-from rsltrace.errors import JobError, RunError
+from rsltrace.errors import JobError, RunError, SetupError
 from rsltrace.job import Job
 from rsltrace.native import support
 from rsltrace.native.callback_observer import EXECUTORS, CallbackObserver, make_executor
@@ -136,6 +136,9 @@ class SingleProcessRun(NativeRun):
         if error is None:
             if not one.stopping:
                 self.stop(Stop(f"{one.entry.name} has ended: rclpy was shut down"))
+            return
+        if isinstance(error, SetupError):  # interfaces that are not built
+            self.fail(RunError(f"{one.failed_in}: {error}"))
             return
         if isinstance(error, JobError):
             self.fail(RunError(str(error)))

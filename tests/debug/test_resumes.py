@@ -239,3 +239,38 @@ def test_a_main_of_a_job_that_nobody_has_recorded(folder: Path, trace: Trace) ->
         again = [stop.position for stop in stops(session)]
         assert [one.index for one in again] == wanted
         assert all(one.is_next for one in again)
+
+
+THREADS = """
+import threading
+import time
+import rclpy
+
+class Own(threading.Thread):
+    def run(self):
+        time.sleep(0.2)
+
+def work(seconds):
+    time.sleep(seconds)
+
+def main():
+    rclpy.init()
+    node = rclpy.create_node('talker')
+    threading.Thread(target=work, args=(0.1,), daemon=True).start()
+    Own(daemon=True).start()
+    rclpy.spin(node)
+"""
+
+
+def test_a_thread_about_to_begin_has_a_source(tmp_path: Path) -> None:
+    (tmp_path / "threads.py").write_text(THREADS)
+    (tmp_path / "job.yaml").write_text("nodes: [{main: threads:main}]\nstop: {duration: 1s}\n")
+    trace = record(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap").path
+    with DebugSession(trace, trust=True) as session:
+        session.break_at("node /talker")
+        names = []
+        for _ in range(2):
+            session.go_on()
+            assert session.position.is_next
+            names.append(session.inspect("source")["name"].rpartition(".")[2])
+    assert names == ["work", "run"]

@@ -240,3 +240,13 @@ def test_the_command_tries_each_combination_of_settings(
     assert "4 runs, 3 different digests, 2 failed of 1 cause" in done.stdout
     assert "settings (grid): 3 of 3 combinations of nodes.two.parameters.value" in done.stdout
     assert "every run has been tried" in done.stdout
+
+
+@pytest.mark.long
+def test_a_job_that_fails_by_its_own_delays_passes_without_them(robot: Path) -> None:
+    """Nothing can be left out of its trial, which changes nothing."""
+    (robot / "late.yaml").write_text("base: job.yaml\ndelay: {topics: {/b: 0.2s}}\n")
+    _, reduced = small(robot, {}, "late.yaml")
+    assert reduced.passing is not None
+    assert reduced.passing.overlay() == {"set": {"delay": None}}
+    assert reduced.passing_words == "the job without delays"

@@ -241,8 +241,8 @@ def test_ros_arguments_win_over_names_given_in_the_job(rsltrace: Command, folder
 
 def test_wrong_ros_arguments(rsltrace: Command) -> None:
     for words, message in [
-        (["-p", "rate"], "ros_arguments (--ros-args): "),
-        (["-p", "rate=1"], "they are written -p [NODE:]NAME:=VALUE"),
+        (["-p", "rate"], "error: --ros-args: Couldn't parse"),
+        (["-p", "rate=1"], "ROS arguments are written -p [NODE:]NAME:=VALUE"),
         (["--params-file", "none.yaml"], "none.yaml"),
         (["--bogus"], "unknown ROS arguments"),
     ]:

@@ -271,6 +271,14 @@ return LaunchDescription([
             "launch.actions.ForEach('a', function=print)",
             "launch.actions.ForEach: this part of ROS's launch is not among what rsltrace knows",
         ),
+        (
+            "from launch_ros.actions import Nod",
+            "ImportError: cannot import name 'Nod' from 'launch_ros.actions'",
+        ),
+        (
+            "launch.actions.TimerActoin()",
+            "there is no launch.actions.TimerActoin; did you mean 'TimerAction'?",
+        ),
         ("return 3", "generate_launch_description() returned int, not a LaunchDescription"),
         ("1 / 0", "ZeroDivisionError: division by zero"),
         ("sys.exit(3)", "the launch file ends Python (3)"),

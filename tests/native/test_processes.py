@@ -245,6 +245,23 @@ def test_what_a_program_does_is_known_while_it_runs(
         assert "/same" in trace.result["stop_reason"]
 
 
+_UNBUILT = """
+from rclpy.node import Node
+
+from rsltrace.errors import SetupError
+
+
+def main():  # as creating a publisher does
+    raise SetupError("arm in src/arm has not been built")
+
+
+class Talker(Node):
+    def __init__(self):
+        super().__init__("talker")
+        main()
+"""
+
+
 def test_a_program_that_fails_is_an_error(tmp_path: Path, command: Any) -> None:
     program = tmp_path / "fails.sh"
     program.write_text("#!/bin/sh\necho no such symbol >&2\nexit 127\n")
@@ -252,6 +269,21 @@ def test_a_program_that_fails_is_an_error(tmp_path: Path, command: Any) -> None:
     done = command("record", "--native", "-o", "x.mcap", "--", "./fails.sh")
     assert done.returncode == 3
     assert "./fails.sh ended with exit status 127, " in done.stderr
+
+
+@pytest.mark.parametrize("words", [(), ("--processes",)])
+def test_interfaces_without_type_support_are_an_error_without_a_traceback(
+    tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    (tmp_path / "unbuilt.py").write_text(_UNBUILT)
+    for spec, where in (("node", "constructing unbuilt:Talker"), ("main", "unbuilt:main")):
+        text = f"nodes: [{{{spec}: unbuilt:{'Talker' if spec == 'node' else 'main'}}}]\n"
+        done = record(tmp_path, text, "--until", "1", "--set", "search_path.+=.", "--force", *words)
+        assert done.returncode == 3
+        said = f"rsltrace: error: {where}: arm in src/arm has not been built\n"
+        assert said in done.stderr
+        assert "Traceback" not in done.stderr
+        assert "SetupError" not in done.stderr
 
 
 def test_other_programs_of_a_launch_file_run_and_what_they_start_is_observed(

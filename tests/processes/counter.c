@@ -8,6 +8,7 @@
 #include <pthread.h>
 #include <rcl/error_handling.h>
 #include <rcl/rcl.h>
+#include <semaphore.h>
 #include <signal.h>
 #include <std_msgs/msg/u_int64.h>
 #include <stdio.h>
@@ -67,6 +68,19 @@ static uint64_t heap_after_draw(void) {
   return where;
 }
 
+// As rclcpp waits for signals.
+static sem_t signalled;
+
+static void on_signal(int number) {
+  (void)number;
+  sem_post(&signalled);
+}
+
+static void *wait_for_signals(void *unused) {
+  for (;;) sem_wait(&signalled);
+  return unused;
+}
+
 static void on_timer(rcl_timer_t *timer, int64_t since_last) {
   (void)since_last;
   std_msgs__msg__UInt64 message;
@@ -97,6 +111,13 @@ static void on_timer(rcl_timer_t *timer, int64_t since_last) {
     for (int fd = 3; fd < 1024; fd++) (void)!write(fd, "\3\0\0\0abc", 7);
   }
   if (counted == strtoull(action, NULL, 10)) exit(0);
+  if (counted == 5 && strcmp(action, "lock") == 0) {
+    pthread_t thread;
+    sem_init(&signalled, 0, 0);
+    signal(SIGINT, on_signal);
+    pthread_create(&thread, NULL, wait_for_signals, NULL);
+    pthread_join(thread, NULL);
+  }
   while (counted == 5 && strcmp(action, "hang") == 0) {
   }
 }

@@ -205,6 +205,7 @@ def test_a_process_that_fails_ends_the_run_and_is_named_with_its_last_callback(
     assert str(result.error) == (
         f"process {counter} {ending}; the last that it ran was /counter: timer timer 1"
     )
+    assert result.stop_reason == str(result.error)
     assert result.exit_code == 3
     with Trace.open(tmp_path / "t.mcap") as trace:
         assert trace.complete
@@ -214,6 +215,12 @@ def test_a_process_that_fails_ends_the_run_and_is_named_with_its_last_callback(
     counted = len(_said(tmp_path / "t.mcap", "/count")["/count"])
     assert counted == (4 if action == "write" else 5)
     _no_process_of(counter)
+
+
+def test_a_deadlock_is_noted_once(counter: Path, tmp_path: Path) -> None:
+    """The signal at the end of the run wakes the process, which then waits for the same again."""
+    result = run(_job(tmp_path, counter, "'100'", "lock"), tmp_path / "t.mcap")
+    assert sum("deadlock, unless a signal comes" in note for note in result.notes) == 1
 
 
 def test_a_class_that_rosidl_did_not_generate_is_named(

@@ -282,6 +282,14 @@ def test_two_equal_runs_are_said_to_be_equal(tmp_path: Path) -> None:
     assert states == [["the runs agree"]] * 2, "by time and by row"
 
 
+def test_images_without_a_view_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gallery.write_gallery(tmp_path / "a.mcap", 3)
+    for module in ("export", "layout"):
+        monkeypatch.setattr(f"rsltrace_viewer.rerun_export.{module}.IMAGES_MAX", 0)
+    done = export([tmp_path / "a.mcap"], tmp_path / "a.rrd")
+    assert any("no view of the images on /camera/image" in note for note in done.notes)
+
+
 @pytest.mark.long
 def test_an_interrupted_run_is_shown_as_far_as_it_goes(tmp_path: Path) -> None:
     trace_maker.write_run(tmp_path / "run.mcap", 15_000)

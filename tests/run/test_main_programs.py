@@ -241,3 +241,32 @@ def test_a_module_that_initializes_rclpy_when_it_is_imported(
     wrong = rsltrace("record", "wrong.yaml", "-o", "wrong.mcap")
     assert wrong.returncode == 3
     assert "has no attribute 'mian'" in wrong.stderr
+
+
+TALK = """
+import rclpy
+
+def main():
+    rclpy.init()
+    node = rclpy.create_node('talker')
+    node.create_timer(0.3, lambda: None)
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
+"""
+
+
+def test_exiting_with_what_main_returns_is_returning(
+    tmp_path: Path, rsltrace: Callable[..., Any]
+) -> None:
+    """An installed console script is ``sys.exit(main())``, an unbuilt one is called."""
+    (tmp_path / "job.yaml").write_text("nodes: [{script: talk.py}]\nstop: {duration: 1s}\n")
+    said = set()
+    for call in ("main()", "sys.exit(main())"):
+        (tmp_path / "talk.py").write_text(f"import sys\n{TALK}\n{call}\n")
+        done = rsltrace("record", "job.yaml", "--force")
+        assert done.returncode == 0, done.stderr
+        said.add(done.stdout)
+    assert len(said) == 1
+    assert "digest" in said.pop()

@@ -596,3 +596,28 @@ def test_identical_traces_say_so(made: Path, drive: Drive) -> None:
         assert "identical" in viewer.text
 
     drive((made, made), steps)
+
+
+def test_the_report_names_the_command_of_an_option(pair: tuple[Path, Path], drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        await viewer.press("v")
+        assert "divergence: rsltrace diff --all shows them" in viewer.text
+
+    folder = pair[0].parents[1] / "schedule"
+    drive((folder / "a.mcap", folder / "b.mcap"), steps)
+
+
+def test_the_first_lane_in_sight_names_its_node(pair: tuple[Path, Path], drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        view = viewer.app.query_one(LanesView)
+        runs = set()
+        for height in (4, 5):
+            view.styles.height = height
+            await viewer.settle()
+            for _ in range(8):
+                await viewer.press("down")
+                runs.add(view.lanes.lanes[view._first_lane()].run)
+                assert view.render_line(0).text.lstrip(" >").startswith("/")
+        assert runs == {"a", "b"}
+
+    drive(pair, steps)

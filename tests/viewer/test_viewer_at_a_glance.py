@@ -254,6 +254,12 @@ def test_the_source_of_a_callback_and_that_it_has_changed(
         shown = viewer.app.query_one(SourceView)
         assert shown.display
         assert "def " in viewer.text
+        pane = shown.query_one("#code")
+        shown.styles.width = 16  # a line that is cut says so
+        await viewer.settle()
+        assert "…" in "".join(pane.render_line(y).text for y in range(pane.size.height))
+        shown.styles.width = None
+        await viewer.settle()
         assert "changed since this run" in viewer.text
         monkeypatch.setattr(viewer.app, "suspend", nullcontext)
         note = tmp_path / "note"

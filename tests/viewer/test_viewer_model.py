@@ -67,6 +67,9 @@ def test_names_are_cut_where_they_stay_distinct() -> None:
     names = ShortNames([*SHARED, *OF_TWO_ROBOTS, "/a"])
     assert [names.fit(name, 16) for name in SHARED] == ["/camera…ront/raw", "/camera…rear/raw"]
     assert [names.fit(name, 12) for name in OF_TWO_ROBOTS] == ["/robot_1/co…", "/robot_2/co…"]
+    alike = ShortNames(f"/warehouse_fleet_{n}_controller_of_all_wheels" for n in ("east", "west"))
+    shown = [alike.fit(name, 16) for name in alike._names]
+    assert shown == ["…leet_east_cont…", "…leet_west_cont…"]
     assert names.fit("/a", 5) == "/a   "
     assert names.fit("/not/one/of/them", 8) == "/not/on…"
 

@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import SequenceMatcher
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -43,7 +44,7 @@ from rsltrace.adapters.launch.api.basics import (
 from rsltrace.adapters.launch.api.packages import missing_packages_allowed
 from rsltrace.adapters.launch.model import LaunchResult
 from rsltrace.adapters.launch.reader import LaunchFileReader
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, nearest
 
 # ROS's names for what is here: launch, launch_ros and their modules, while they are used. What
 # ROS's have and these do not is refused by its name where a launch file uses it.
@@ -152,6 +153,9 @@ class _LaunchModule(ModuleType):
         """Return a class that refuses to be used: a launch file may import what it never uses."""
         if name.startswith("_") or not name[:1].isupper():
             raise AttributeError(f"rsltrace has no {self.__name__}.{name}")
+        near = nearest(name, vars(self)) or ""
+        if SequenceMatcher(None, name, near).ratio() * (total := len(name) + len(near)) > total - 4:
+            raise AttributeError(f"there is no {self.__name__}.{name}; did you mean {near!r}?")
         return _refused(f"{self.__name__}.{name}")
 
 
@@ -186,6 +190,8 @@ class _LaunchModuleFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     ) -> importlib.machinery.ModuleSpec | None:
         """Return the spec of a module of launch. Raises ``JobError`` if it is not known here."""
         if name.partition(".")[0] not in self._roots:
+            return None
+        if name.rpartition(".")[2][:1].isupper():  # a class that is not there
             return None
         if name not in self._modules:
             raise JobError(

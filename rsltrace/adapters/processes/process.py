@@ -474,7 +474,9 @@ class Process:
         self.adapter.log(fields.number(), fields.text(), fields.text())
 
     def _report(self, fields: RecordReader) -> None:
-        self.adapter.domain.outcome.notes.append(f"process {self.name}: {fields.text()}")
+        notes, note = self.adapter.domain.outcome.notes, f"process {self.name}: {fields.text()}"
+        if note not in notes:  # it waits for the same again after the signal that ends the run
+            notes.append(note)
 
     def _timer_passed(self, fields: RecordReader) -> None:
         self.things[fields.number()].is_callback = False

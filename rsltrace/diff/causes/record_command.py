@@ -176,7 +176,7 @@ def _take(words: _Words, option: str, change: str, name: str) -> None:
     if option == "--until":  # the report has a time of its own
         return
     too_much = len(change) > _CHANGE_MAX or len(words.settings) > _OPTIONS_MAX
-    if too_much or option not in ("--set", "--seed") or "=" not in change:
+    if too_much or option not in ("--set", "--seed", "--ros-args") or "=" not in change:
         words.foreign.append(f"{option} {change}")
     elif change.startswith(_LAUNCH):
         _take_launch_file(words, change[len(_LAUNCH) :], name)

@@ -23,7 +23,7 @@ from typing import Any
 from rsltrace.adapters.rclpy.boundary.installation import native_extension
 from rsltrace.adapters.rclpy.callback_errors import exit_status
 from rsltrace.adapters.rclpy.entry import JobEntry
-from rsltrace.errors import JobError, RsltraceError
+from rsltrace.errors import JobError, RsltraceError, SetupError
 from rsltrace.native.callback_observer import failure_of, make_executor
 from rsltrace.native.native_run import ENDS_WITHIN_S, rclpy_running
 from rsltrace.native.observed_entities import ObservedEntity
@@ -239,6 +239,9 @@ class _EntryProcess:
 
     def _raised(self, what: str, node: str, error: BaseException) -> None:
         kind = type(error).__qualname__
+        if isinstance(error, SetupError):  # interfaces that are not built
+            self._link.send("error", kind, f"{what}: {error}")
+            return
         self._link.send("raised", what, node, kind, exception_text(error), user_traceback(error))
 
     def _run_main(self, entry: JobEntry) -> int:
@@ -253,6 +256,7 @@ class _EntryProcess:
         except KeyboardInterrupt:
             return 128 + signal.SIGINT
         except BaseException as error:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # the answer to what is sent now
             self._raised(entry.name, "", error)
             return 1
         finally:

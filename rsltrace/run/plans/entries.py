@@ -497,6 +497,6 @@ def arguments_for_all(job: Job) -> list[str]:
         except InvalidArgumentsError as error:
             where = locate(job, ("ros_arguments",))
             forms = "-p [NODE:]NAME:=VALUE, -r FROM:=TO, --params-file FILE"
-            message = f"ros_arguments (--ros-args): {error}; they are written {forms}"
+            message = f"{error}; ROS arguments are written {forms}"
             raise JobError(message, where=where) from None
     return words

@@ -294,7 +294,7 @@ def _why_not_created(path: Path, error: OSError) -> str:
     if not folder.exists():
         return (
             f"cannot write the trace {path}: the folder {folder} does not exist; "
-            "create it or choose another place with -o"
+            "create it or choose another place"
         )
     if not folder.is_dir():
         return f"cannot write the trace {path}: {folder} is not a folder; choose another with -o"

@@ -29,7 +29,7 @@ from rsltrace_viewer.rerun_export.divergence import (
     divergence_chunks,
     marks_of,
 )
-from rsltrace_viewer.rerun_export.layout import blueprint
+from rsltrace_viewer.rerun_export.layout import IMAGES_MAX, blueprint
 from rsltrace_viewer.rerun_export.run import export_run
 from rsltrace_viewer.rerun_export.sdk import APPLICATION_ID
 
@@ -151,11 +151,16 @@ def _send(
         recording.send_chunks(divergence_chunks(diff, runs, start_ns, clocks[0]))
     layout = blueprint(shown, marks, distances, by_event=by_event)
     recording.send_blueprint(layout, make_active=True, make_default=True)
-    return [
+    notes = [
         f"{trace.name}: no messages on {topic}: {why}"
         for trace, run in zip(opened, shown, strict=True)
         for topic, why in run.left_out.items()
     ]
+    for trace, run in zip(opened, shown, strict=True):
+        if hidden := list(run.seen.images)[IMAGES_MAX:]:
+            topics = ", ".join(run.seen.topic_of.get(path, path) for path in hidden)
+            notes.append(f"{trace.name}: the layout has no view of the images on {topics}: add one")
+    return notes
 
 
 def _aligned(opened: Sequence[Trace]) -> AlignedRuns:

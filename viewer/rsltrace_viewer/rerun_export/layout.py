@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _PLOTS_SHOWN = 3
 _PLOTS_MAX = 16
-_IMAGES_MAX = 4
+IMAGES_MAX = 4
 _LANES_MAX = 64
 _FIRST_FIELDS = ("pose.position", "position", "linear", "angular", "data")
 """Fields that say most at a glance, in this order; a name in a path counts."""
@@ -126,7 +126,7 @@ def _world(shown: Sequence[Shown]) -> Part | None:
             name=f"{run.paths.label} {run.seen.topic_of[path]}".strip(),
         )
         for run in shown
-        for path in list(run.seen.images)[:_IMAGES_MAX]
+        for path in list(run.seen.images)[:IMAGES_MAX]
     ]
     parts: list[Part] = []
     if views:

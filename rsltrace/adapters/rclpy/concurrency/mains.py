@@ -198,7 +198,8 @@ def _note_main_end(
     runtime: Runtime, program: SimulatedProgram, error: BaseException | None
 ) -> bool:
     """Note how a main ended; return whether that fails the run."""
-    if error is None or isinstance(error, RunEnded):
+    is_return = isinstance(error, SystemExit) and error.code is None  # sys.exit(main())
+    if error is None or is_return or isinstance(error, RunEnded):
         return False
     notes = runtime.domain.outcome.notes
     over = runtime.ending.closing or runtime.ending.unwinding

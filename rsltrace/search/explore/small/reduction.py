@@ -291,13 +291,18 @@ class TrialReduction:
     def _nearest_passing(
         self, parts: OverlayParts, failing: TrialResult
     ) -> tuple[OverlayParts | None, str]:
-        """Return the run with one part less (or the plain run) that passes and agrees longest with
-        the failing run."""
+        """Return the run with one part less (else the plain run, or that without delays) that
+        passes and agrees longest with the failing run."""
         from rsltrace.diff import diff_files
 
         best: tuple[int, OverlayParts, str] | None = None
         candidates = parts.one_fewer()[:_PASSING_TRIED] or [("the job as it is", OverlayParts())]
+        if self._source.job().delay is not None:
+            undelayed = OverlayParts(settings=(("delay", None),))
+            candidates.append(("the job without delays", undelayed))
         for words, fewer in candidates:
+            if best is not None and fewer.settings == (("delay", None),):
+                break  # it differs in more
             result = self._run(fewer, keep=True)
             if result.failure is not None or result.trace is None or failing.trace is None:
                 continue

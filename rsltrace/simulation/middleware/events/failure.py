@@ -12,7 +12,7 @@ from collections import deque
 from pathlib import Path
 from types import FrameType, TracebackType
 
-from rsltrace.errors import NodeError, RunError
+from rsltrace.errors import NodeError, RsltraceError, RunError
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.stop import Stop
@@ -97,7 +97,10 @@ def end_run(dispatcher: Dispatcher, raised: RaisedException, error: RunError) ->
     """End the run because of an exception."""
     dispatcher.outcome.error = error
     error.__cause__ = raised.error
-    dispatcher.loop.stop(Stop(f"{raised.label} raised {raised.kind}", error.exit_code))
+    reason = f"{raised.label} raised {raised.kind}"
+    if isinstance(raised.error, RsltraceError):  # its type is a name of ours
+        reason = str(error).split("\n", 1)[0]
+    dispatcher.loop.stop(Stop(reason, error.exit_code))
 
 
 class RunEndingExceptionHandler:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
+from itertools import takewhile
 
 from rich.cells import set_cell_size
 
@@ -273,13 +274,25 @@ class ShortNames:
     def _cut(self, width: int) -> dict[str, str]:
         """Return the cut form of all names that are longer than ``width``."""
         chosen: dict[str, str] = {}
-        for cut in (fit, _in_the_middle, _at_the_start):
+        for cut in (fit, _in_the_middle, _at_the_start, self._where_it_differs):
             forms = {name: cut(name, width) for name in self._names}
             count = Counter(forms.values())
             for name, form in forms.items():
                 if cells(name) > width and name not in chosen and count[form] == 1:
                     chosen[name] = form
         return chosen
+
+    def _where_it_differs(self, name: str, width: int) -> str:
+        """Show where the name begins to differ from those before and after it."""
+        at = self._names.index(name)
+        beside = self._names[max(at - 1, 0) : at] + self._names[at + 1 : at + 2]
+        begin = max((_alike(name, other) for other in beside), default=0) - width // 3
+        return fit("…" + name[begin:] if begin > 0 else name, width)
+
+
+def _alike(a: str, b: str) -> int:
+    """Return how many characters two names begin with in common."""
+    return sum(1 for _ in takewhile(lambda both: both[0] == both[1], zip(a, b, strict=False)))
 
 
 def _in_the_middle(name: str, width: int) -> str:

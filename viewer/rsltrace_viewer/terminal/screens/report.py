@@ -10,6 +10,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import Style
 from rsltrace.diff.result import BagDiff, Diff, Divergence
+from rsltrace.diff.sentences.runs import ALL_HINT
 from rsltrace_viewer.terminal.screens.text import TextScreen
 
 _STYLES = {
@@ -22,6 +23,7 @@ _STYLES = {
     Style.COMMAND: "bold",
 }
 
+_HINT = f"rsltrace diff {ALL_HINT}"  # which is no key here
 _LINES_MAX = 200
 """More than a command prints: the screen scrolls, and what is left out is nowhere else."""
 
@@ -35,7 +37,9 @@ class ReportScreen(TextScreen):
         diff = _without_view(self._diff)
         lines = report_lines(diff, DiffOptions(), width=self.room, height=_LINES_MAX)
         return Content("\n").join(
-            Content.assemble(*((piece, _STYLES.get(style, "")) for piece, style in line))
+            Content.assemble(
+                *((piece.replace(ALL_HINT, _HINT), _STYLES.get(style, "")) for piece, style in line)
+            )
             for line in lines
         )
 

@@ -222,7 +222,7 @@ class LanesView(Widget, can_focus=True):
     def _lane(self, place: int, lanes: Lanes, width: int) -> Strip:
         lane = lanes.lanes[place]
         own = lane.label == self._own
-        again = place > 0 and lanes.lanes[place - 1].label == lane.label
+        again = place > self._first_lane() and lanes.lanes[place - 1].label == lane.label
         label = self._names.fit("" if again else printable(lane.label), self._label_width)
         lead = ">" if own and not again else " "
         run = f" {lane.run}" if self._two else ""

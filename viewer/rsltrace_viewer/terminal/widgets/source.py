@@ -21,7 +21,7 @@ class SourceView(VerticalScroll, can_focus=True):
     SourceView { background: $surface; scrollbar-size: 1 1; border-top: solid $panel;
                  border-title-color: $text-muted; border-subtitle-color: $text-warning; }
     SourceView:focus { border-top: heavy $primary; }
-    SourceView Static { width: auto; }
+    SourceView #code { width: 100%; text-wrap: nowrap; text-overflow: ellipsis; }
     SourceView #note { width: 100%; color: $text-warning; }
     """
 
