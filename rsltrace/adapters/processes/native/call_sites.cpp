@@ -16,6 +16,7 @@
 #include <utility>
 #include <vector>
 
+#include "python_symbols.h"
 #include "real.h"
 #include "scheduler.h"
 
@@ -237,6 +238,7 @@ RSLTRACE_EXPORT pid_t getpid() noexcept {
 RSLTRACE_EXPORT char *getenv(const char *name) noexcept {
   char *const value = REAL(getenv)(name);
   const void *caller = __builtin_return_address(0);
+  if (strncmp(name, "PYTHON", 6) == 0) rsltrace_start_python(caller);
   if (is_own_code(caller)) note_variable(name, value, caller);
   return value;
 }
