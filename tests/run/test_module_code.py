@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.run.provenance import module_code
+from rsltrace.job import load_job
+from rsltrace.run.provenance import module_code, source_files
 
 CODE = 'import pkg.gains\n\n\ndef go(x):\n    """Go."""\n    return [x, 1.5]\n'
 
@@ -78,3 +79,15 @@ def test_what_is_not_python_is_left_out(tmp_path: Path) -> None:
         files[name].write_text(text)
     files["gone"] = tmp_path / "gone.py"
     assert list(module_code(files)) == ["odd.py"]
+
+
+def test_parameter_files_of_command_lines_are_hashed(tmp_path: Path) -> None:
+    (tmp_path / "p.yaml").write_text("/**: {ros__parameters: {gain: 1}}\n")
+    (tmp_path / "none").touch(0o755)
+    (tmp_path / "q.yaml").write_text("/**: {ros__parameters: {gain: 2}}\n")
+    (tmp_path / "job.yaml").write_text(
+        "nodes:\n  - {program: ./none, arguments: [--ros-args, --params-file, p.yaml]}\n"
+        "ros_arguments: [--params-file, q.yaml]\nstop: {duration: 1s}\n"
+    )
+    found = source_files(load_job(tmp_path / "job.yaml"))
+    assert {"file:p.yaml", "file:q.yaml"} <= set(found)
