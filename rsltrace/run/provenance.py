@@ -15,6 +15,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
@@ -206,10 +207,11 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 
 def source_files(job: Job) -> dict[str, Path]:
-    """Return the files of ``loaded_modules``, and the job's scripts, programs, executables and
-    model files (``file:`` and what the job calls them)."""
+    """Return the files of ``loaded_modules``, and the job's scripts, programs, executables,
+    parameter files of command lines and model files (``file:`` and what the job calls them)."""
     modules = loaded_modules(job)
     modules.update(_run_as_main(job))
+    modules.update(_parameter_files(job))
     modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
     return modules
 
@@ -306,6 +308,13 @@ def _run_as_main(job: Job) -> Iterator[tuple[str, Path]]:
             found = run_as_main(spec.module)
             if found is not None and is_below(found.origin or "", folders):
                 yield found.name, Path(found.origin or "")
+
+
+def _parameter_files(job: Job) -> Iterator[tuple[str, Path]]:
+    for words in (job.ros_arguments, *(spec.arguments for spec in job.nodes)):
+        for flag, path in pairwise(words):
+            if flag == "--params-file" and job.resolve(path).is_file():
+                yield f"file:{path}", job.resolve(path)
 
 
 def _module_of(target: Target | None) -> str:

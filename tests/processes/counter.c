@@ -4,7 +4,8 @@
 // Instead it publishes with "address" where its timer lies, with "heap" where new memory lies after a
 // draw, with "rand" the last of 90 random numbers and one for each count, with "thread" its thread's id, with "heaps" from how many heaps two threads, one after the
 // other, got memory. It counts from the number in COUNT_FROM, and from that in the file "more" in its
-// folder. With NAMED there is another node, and callbacks are told to tracetools as rclcpp does it.
+// folder. With LATE_PYTHON it loads that libpython, and starts it. With NAMED there is another node, and callbacks are told to tracetools as rclcpp does it.
+#include <dlfcn.h>
 #include <pthread.h>
 #include <rcl/error_handling.h>
 #include <rcl/rcl.h>
@@ -144,7 +145,17 @@ static void tell_names(const rcl_node_t *node, const rcl_timer_t *timer,
   ros_trace_rclcpp_callback_register(&callbacks[1], "Counter::echo(UInt64)");
 }
 
+static void start_python(const char *library) {
+  void *python = dlopen(library, RTLD_NOW | RTLD_GLOBAL);
+  void (*start)(int) = (void (*)(int))dlsym(python, "Py_InitializeEx");
+  int (*run)(const char *) = (int (*)(const char *))dlsym(python, "PyRun_SimpleString");
+  start(0);
+  if (run("import json\nassert json.loads('[true]')[0] is (1 == 1) and RuntimeError('x').args") != 0)
+    exit(8);
+}
+
 int main(int argc, const char **argv) {
+  if (getenv("LATE_PYTHON") != NULL) start_python(getenv("LATE_PYTHON"));
   counted = first();
   const int64_t period_ms = argc > 1 && argv[1][0] != '-' ? atoi(argv[1]) : 100;
   if (argc > 2 && argv[2][0] != '-') action = argv[2];

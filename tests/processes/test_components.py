@@ -132,7 +132,10 @@ def test_a_component_whose_container_is_not_there_is_named(folder: Path) -> None
     assert "demo/demo::First has not started: it waited for service /container/" in notes[0]
 
 
-def test_without_the_interface_the_error_says_what_to_install(folder: Path) -> None:
+def test_without_the_interface_the_error_says_what_to_install(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)  # which may have it, too
     (folder / "composition_interfaces" / "package.xml").unlink()
     (folder / "job.yaml").write_text(JOB.format(second="Second", on_exception="stop"))
     with pytest.raises(JobError, match=r"job\.yaml:4:16: composition_interfaces/srv/LoadNode"):

@@ -4,6 +4,7 @@ are called."""
 from __future__ import annotations
 
 import struct
+import sysconfig
 from collections.abc import Callable
 from pathlib import Path
 
@@ -35,6 +36,18 @@ def _counts(path: Path) -> list[tuple[int, int]]:
     with Trace.open(path) as trace:
         said = trace.messages("/count")
         return [(stamp // 1_000_000, struct.unpack("<Q", data[-8:])[0]) for stamp, _, data in said]
+
+
+_LIBPYTHON = Path(*map(str, sysconfig.get_config_vars("LIBDIR", "LDLIBRARY")))
+
+
+@pytest.mark.skipif(
+    not sysconfig.get_config_var("Py_ENABLE_SHARED"), reason="needs a libpython of its own"
+)
+def test_a_process_may_load_python_late(compiled: Compiled, tmp_path: Path) -> None:
+    """Python then finds the symbols that stand in for its own first."""
+    entry = f"    environment: {{LATE_PYTHON: {_LIBPYTHON}}}"
+    assert _run(tmp_path, compiled("counter.c"), entry).error is None
 
 
 def test_a_process_has_an_environment_and_a_folder_of_its_own(

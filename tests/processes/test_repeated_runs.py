@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -150,6 +151,23 @@ def test_where_memory_lies_does_not_depend_on_the_folder_for_caches(
         (tmp_path / name).symlink_to(root)
         monkeypatch.setattr(cache, "_root", lambda place=tmp_path / name: place)
         found.append(_counts(tmp_path, f"{len(found)}.mcap"))
+    assert all(one == found[0] for one in found)
+
+
+def test_where_memory_lies_does_not_depend_on_the_folder_of_the_program(
+    compiled: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """rcl copies the command line; and the trace has the program's path."""
+    found = []
+    for folder in ("a", "b" * 20, "c" * 200):
+        program = tmp_path / folder / "counter"
+        program.parent.mkdir()
+        shutil.copy(compiled("counter.c"), program)
+        (tmp_path / "job.yaml").write_text(
+            f"nodes: [{{program: {program}, arguments: ['100', heap]}}]\n"
+            "stop: {duration: 250ms}\n"
+        )
+        found.append(_counts(tmp_path, f"{folder}.mcap"))
     assert all(one == found[0] for one in found)
 
 

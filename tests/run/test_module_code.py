@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.run.provenance import SourceHashes, module_code
+from rsltrace.job import load_job
+from rsltrace.run.provenance import SourceHashes, module_code, source_files
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
@@ -92,3 +93,15 @@ def test_a_file_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
         SourceHashes(writer, files)
     with Trace.open(tmp_path / "a.mcap") as trace:
         assert [*trace.metadata(METADATA_SOURCES)] == ["node.py"]
+
+
+def test_parameter_files_of_command_lines_are_hashed(tmp_path: Path) -> None:
+    (tmp_path / "p.yaml").write_text("/**: {ros__parameters: {gain: 1}}\n")
+    (tmp_path / "none").touch(0o755)
+    (tmp_path / "q.yaml").write_text("/**: {ros__parameters: {gain: 2}}\n")
+    (tmp_path / "job.yaml").write_text(
+        "nodes:\n  - {program: ./none, arguments: [--ros-args, --params-file, p.yaml]}\n"
+        "ros_arguments: [--params-file, q.yaml]\nstop: {duration: 1s}\n"
+    )
+    found = source_files(load_job(tmp_path / "job.yaml"))
+    assert {"file:p.yaml", "file:q.yaml"} <= set(found)

@@ -356,14 +356,14 @@ def program(
         around["AMENT_PREFIX_PATH"] = os.pathsep.join(found)
     known = [*libraries, *_listed(around, "LD_LIBRARY_PATH")]
     around["LD_LIBRARY_PATH"] = os.pathsep.join([*known, *_not_in(known, around)])
-    fixed = True if pinned else None
+    words, fixed = list(command), True if pinned else None
     noise, _, random = around.pop(MEMORY_NOISE, "0:0").partition(":")
     fragments = 0
     if is_native:  # Python depends on addresses as the run's own process does
         fixed, fragments = fixed if random == "0" else False, int(noise)
-    return ProcessProgram(
-        list(command), around, folder, fixed, fragments, instant_sleep, intra_process
-    )
+        if path.is_absolute():  # rcl keeps copies in the heap
+            words[0] = words[0].rjust(_PATH_BYTES, "/")
+    return ProcessProgram(words, around, folder, fixed, fragments, instant_sleep, intra_process)
 
 
 def _not_in(known: Sequence[str], environment: Mapping[str, str]) -> list[str]:

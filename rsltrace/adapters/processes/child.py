@@ -217,7 +217,9 @@ class ProcessHandle:
                 )
         except OSError as error:
             self._close_files()
-            raise JobError(f"{name} cannot be started: {error.strerror}: {argv[0]}") from error
+            raise JobError(
+                f"{name} cannot be started: {error.strerror}: {Path(argv[0])}"
+            ) from error
         finally:
             os.close(turns)
         self._patience = 0

@@ -16,6 +16,7 @@
 #include <utility>
 #include <vector>
 
+#include "python_symbols.h"
 #include "real.h"
 #include "scheduler.h"
 
@@ -26,7 +27,7 @@ constexpr int DEPTH = 16;
 constexpr int DEPTH_OF_TEMPLATES = 64;  // of rclcpp, unoptimized
 constexpr std::uint32_t NOTES_PER_EVENT = 100;  // as many as the guard keeps
 constexpr std::uint32_t DRAWS_FIRST = 4;        // of an event, at each place: then only the last one
-constexpr std::size_t VARIABLE_BYTES = 4096;    // of a record
+constexpr std::size_t RECORD_BYTES = 4096;  // more than most paths need
 constexpr std::uint32_t LOOKS_FIRST = 32;       // at clocks, from each place
 constexpr std::uint32_t SENDERS_FIRST = 32;     // as adapters/rclpy/concurrency/code_lines.py
 
@@ -48,11 +49,22 @@ bool is_library(const Dl_info &info) {
   return false;
 }
 
-// Of libraries no more is kept: how long the path of ours is must not show in the heap.
+// The path of a file that may be unloaded. Not in the heap either; "" if there are too many.
+const char *kept(const char *path) {
+  static char paths[16 * PATH_MAX];
+  static char *end = paths;
+  for (char *one = paths; one < end; one += strlen(one) + 1)
+    if (strcmp(one, path) == 0) return one;
+  const std::size_t size = strlen(path) + 1;
+  if (end + size > paths + sizeof paths) return "";
+  return static_cast<char *>(memcpy(std::exchange(end, end + size), path, size));
+}
+
+// Of libraries no more is kept.
 struct Caller {
   bool own = false;
   std::uint32_t event = 0;  // in which it drew
-  std::string file;
+  const char *file = "";
   std::uint64_t offset = 0;  // of the call, not of where it returns to
   std::uint32_t calls = 0;   // of a clock; draws of the event
 };
@@ -76,12 +88,12 @@ Caller &caller_at(const void *address) {
   Dl_info info{};
   if (!is_new || dladdr(address, &info) == 0 || info.dli_fname == nullptr) return found->second;
   const auto offset = static_cast<const char *>(address) - 1 - static_cast<char *>(info.dli_fbase);
-  if (!is_library(info)) found->second = {true, 0, info.dli_fname, static_cast<std::uint64_t>(offset)};
+  if (!is_library(info)) found->second = {true, 0, kept(info.dli_fname), static_cast<std::uint64_t>(offset)};
   return found->second;
 }
 
 void write_frame(Writer &body, const Caller &caller) {
-  body.text(caller.file);
+  body.blob(caller.file, strlen(caller.file));
   body.number(caller.offset);
 }
 
@@ -108,8 +120,15 @@ bool is_own_code(const void *caller) { return self != nullptr && linked() && cal
 
 namespace {
 
-Writer start_of_record(Source source, std::uint32_t calls, const char *call, const std::string &answer) {
+// As long for any path.
+Writer start_of_paths() {
   Writer body;
+  body.bytes.reserve(RECORD_BYTES);
+  return body;
+}
+
+Writer start_of_record(Source source, std::uint32_t calls, const char *call, const std::string &answer) {
+  Writer body = start_of_paths();
   body.number(static_cast<std::uint32_t>(source));
   body.number(calls);
   body.text(call);
@@ -162,13 +181,12 @@ void note_variable(const char *name, const char *value, const void *where) {
   Caller &caller = caller_at(where);
   begin_event(caller);
   if (++caller.calls > DRAWS_FIRST) return;
-  Writer body;
-  body.bytes.reserve(VARIABLE_BYTES);  // as for paths
+  Writer body = start_of_paths();
   body.number(static_cast<std::uint32_t>(Source::VARIABLE));
   body.number(1U);
-  body.blob(name, strnlen(name, VARIABLE_BYTES / 8));
+  body.blob(name, strnlen(name, RECORD_BYTES / 8));
   body.number(value == nullptr ? 0U : 1U);
-  body.blob(value, value == nullptr ? 0 : strnlen(value, VARIABLE_BYTES / 8));
+  body.blob(value, value == nullptr ? 0 : strnlen(value, RECORD_BYTES / 8));
   write_stack(body);
   say(Say::DRAW, body);
 }
@@ -200,7 +218,7 @@ void note_sender(std::uint32_t id) {
   if (!linked()) return;
   std::uint32_t &count = (*looks)[(std::uint64_t{id} << 32) | last_ready()];
   if (count > SENDERS_FIRST) return;
-  Writer body;
+  Writer body = start_of_paths();
   body.number(id);
   if (count++ < SENDERS_FIRST) {
     write_stack(body);
@@ -237,6 +255,7 @@ RSLTRACE_EXPORT pid_t getpid() noexcept {
 RSLTRACE_EXPORT char *getenv(const char *name) noexcept {
   char *const value = REAL(getenv)(name);
   const void *caller = __builtin_return_address(0);
+  if (strncmp(name, "PYTHON", 6) == 0) rsltrace_start_python(caller);
   if (is_own_code(caller)) note_variable(name, value, caller);
   return value;
 }
