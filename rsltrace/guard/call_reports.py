@@ -369,6 +369,8 @@ def _open_report(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
     writing = any(c in mode for c in "wax+") if isinstance(mode, str) else flags & _WRITING
     if writing:
         return NondeterminismSource.FILE, f"open({name!r}, {mode or 'w'!r})", "written"
+    if name[:1] + name[-1:] == "<>" and not os.path.exists(name):
+        return None  # code that is in no file: Python looks there for the line of a syntax error
     return NondeterminismSource.FILE, f"open({name!r})", _content(name)
 
 

@@ -39,6 +39,7 @@ import traceback
 import uuid
 import weakref
 from collections.abc import Callable
+from contextlib import closing
 from datetime import date, datetime, timezone
 from random import random as drawn_directly
 from time import time as from_import
@@ -215,7 +216,7 @@ def time_zone(node: Any) -> object:
 
 @case(DETECTED, "SQLite's clock")
 def sqlite_clock(node: Any) -> object:
-    with sqlite3.connect(":memory:") as connection:
+    with closing(sqlite3.connect(":memory:")) as connection:
         return connection.execute("SELECT strftime('%f', 'now')").fetchall()
 
 
@@ -306,7 +307,7 @@ def dev_urandom(node: Any) -> object:
 
 @case(DETECTED, "SQLite's `random()`")
 def sqlite_random(node: Any) -> object:
-    with sqlite3.connect(":memory:") as connection:
+    with closing(sqlite3.connect(":memory:")) as connection:
         return connection.execute("SELECT random()").fetchall()
 
 

@@ -126,6 +126,16 @@ def test_imports_are_watched_and_libraries_are_not(recorded: Callable[..., Any])
         }
 
 
+def test_where_python_looks_for_the_line_of_a_syntax_error_is_no_finding(
+    recorded: Callable[..., Any],
+) -> None:
+    """As a traceback does from Python 3.13 on, of its own lines."""
+    imports = "import ast\nfrom contextlib import suppress"
+    code = node_code("with suppress(SyntaxError):\n    ast.parse('1 +')", imports=imports)
+    with Trace.open(recorded(code).path) as trace:
+        assert not [met for met in trace.guarded if met.is_finding]
+
+
 @pytest.mark.long
 def test_a_million_calls_in_an_event_are_not_a_million_records(
     recorded: Callable[..., Any],

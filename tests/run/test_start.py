@@ -233,6 +233,7 @@ def test_versions_are_those_of_the_packages_metadata() -> None:
     assert "numpy" in known
 
 
+@pytest.mark.filterwarnings("ignore:Implicit None:DeprecationWarning")  # from Python 3.12 on
 def test_versions_are_found_in_either_kind_of_metadata(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
