@@ -361,7 +361,6 @@ def _python_options() -> str:
         f"-O{flags.optimize}": flags.optimize,
         "-b": flags.bytes_warning,
         "-X dev": flags.dev_mode,
-        "-X utf8": flags.utf8_mode,
         "-X no_debug_ranges": "no_debug_ranges" in sys._xoptions,
         f"-X int_max_str_digits={digits}": digits != _DIGITS_MAX,
     }
