@@ -16,7 +16,7 @@ from rsltrace.trace.reader import Trace
 _EVENTS_MAX = 10_000
 """Entries are constructed in the first events, unless they start later."""
 
-_TARGETS = ("node", "main", "executable", "script", "module", "program")
+TARGETS = ("node", "main", "executable", "script", "module", "program")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ def job_entries(trace: Trace, job: dict[str, Any]) -> JobEntries:
             roots.setdefault(one.name, set(of_any)).update(own)
     found = {}
     for number, entry in enumerate(job.get("nodes") or []):
-        targets = [str(entry.get(key)) for key in _TARGETS if entry.get(key)]
+        targets = [str(entry.get(key)) for key in TARGETS if entry.get(key)]
         if targets and entry.get("start_after") is None and waiting.get(targets[0]):
             found[number] = waiting[targets[0]].pop(0)
     return JobEntries(found, roots)

@@ -15,7 +15,7 @@ from typing import Any
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
 from rsltrace.diff.alignment.rows import ComparedTrace
-from rsltrace.diff.causes.job_entries import JobEntries, job_entries
+from rsltrace.diff.causes.job_entries import TARGETS, JobEntries, job_entries
 from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import METADATA_CODE, METADATA_EDITS, METADATA_SOURCES
@@ -175,7 +175,7 @@ class Relevance:
             if rest[1] in _CONSTRUCTING and not place.constructing:
                 return False
             owners = self._nodes_of(rest[0], of_b=setting.a is None)
-            return not owners or bool(owners & place.nodes)
+            return not owners or bool(owners & (place.nodes | place.mains))
         return True
 
     def _is_code_of(self, name: str, place: DivergenceSite) -> bool:
@@ -230,15 +230,17 @@ class Relevance:
 
     def _nodes_of(self, entry: str, *, of_b: bool) -> set[str]:
         """Return the full names of the nodes of an entry of ``nodes:`` (its name, or its number in
-        the job of a, or ``of_b``)."""
+        the job of a, or ``of_b``), and the main that made them."""
         found: set[str] = set()
         for side, (job, made) in enumerate(zip(self._jobs, self._entries, strict=True)):
             for number, node in enumerate(job.get("nodes") or []):
                 names = {node.get("name"), str(number) if side == of_b else None} - {None}
                 if entry in names:
-                    found |= made.nodes.get(number) or {
+                    nodes = made.nodes.get(number) or {
                         name for name, of in self._classes if of == (node.get("node") or "")
                     }
+                    if nodes:
+                        found |= nodes | {str(node[key]) for key in TARGETS if node.get(key)}
         return found
 
     def is_of_a_class(self, node: str) -> bool:
