@@ -298,9 +298,12 @@ def test_a_third_interrupt_ends_a_process_that_swallows_the_second(
         "    def tick(self):\n"
         "        print('stuck', flush=True)\n"
         "        while True:\n"
-        "            try:\n"
-        "                while True: sum(range(9))\n"
-        "            except KeyboardInterrupt: print('swallowed', flush=True)\n",
+        "            try: self.work()\n"
+        "            except KeyboardInterrupt: print('swallowed', flush=True)\n"
+        # Not in the try itself: what Python 3.11 raises where a loop jumps back to the first
+        # instruction of a try, it raises outside of it.
+        "    def work(self):\n"
+        "        while True: sum(range(9))\n",
     )
     process = _interrupted(tmp_path)
     _let_it_run(process.pid, 0.5)  # its handler is over
