@@ -464,7 +464,7 @@ WRITES = {
     "rsltrace/native/processes/run.py": "mkdir",
     "rsltrace/replay/replaying.py": "unlink",
     "rsltrace/search/bisect/repository.py": "mkdir symlink_to",  # names in a commit of git
-    "rsltrace/search/bisect/runs.py": "mkdir",
+    "rsltrace/search/bisect/search.py": "mkdir",
     "rsltrace/search/explore/cluster.py": "mkdir rmtree symlink_to unlink write_bytes",
     "rsltrace/search/explore/outcome.py": "unlink",
     "rsltrace/search/explore/search.py": "unlink",

@@ -21,16 +21,15 @@ from rsltrace.checks.properties import (
 )
 from rsltrace.conditions.condition import ActiveCondition, EventCondition, is_true
 from rsltrace.conditions.expressions import Expression, parse_expression
-from rsltrace.conditions.names import RunNames, names_of
+from rsltrace.conditions.names import OF_MESSAGE, RunNames, names_of, topic_of, with_topic_prefix
 from rsltrace.conditions.occurrences import TopicCondition
 from rsltrace.conditions.text import parse_condition
-from rsltrace.conditions.topic_fields import OF_MESSAGE, topic_of, with_topic_prefix
 from rsltrace.conditions.trace_events import StartOfTrace, TraceEvent, events_of
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError, RsltraceError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec, LatencySpec
-from rsltrace.job.values.target import Target, target_text
+from rsltrace.job.values.checks import Target, target_text
 from rsltrace.run.plans.scheduling import load_target
 from rsltrace.trace.model.finding import decode_unseen
 from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds

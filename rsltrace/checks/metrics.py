@@ -11,7 +11,7 @@ from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import CheckError, ConditionError, JobError, RsltraceError
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.check import MetricSpec
-from rsltrace.job.values.target import target_text
+from rsltrace.job.values.checks import target_text
 from rsltrace.trace.reader import Trace
 
 

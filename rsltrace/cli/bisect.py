@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from rsltrace.child_processes import Processes
     from rsltrace.job import Job
     from rsltrace.search.bisect.repository import GitRepository
-    from rsltrace.search.bisect.runs import RevisionCheck, RevisionRunner
-    from rsltrace.search.bisect.search import BisectResult
+    from rsltrace.search.bisect.search import BisectResult, RevisionCheck, RevisionRunner
 
 _BEFORE, _AFTER = "before.mcap", "after.mcap"
 
@@ -107,8 +106,7 @@ def bisect(
     from rsltrace.child_processes import Processes
     from rsltrace.cli.output.search_text import line_of
     from rsltrace.search.bisect.repository import GitRepository, Worktree
-    from rsltrace.search.bisect.runs import RevisionRunner
-    from rsltrace.search.bisect.search import BisectSearch
+    from rsltrace.search.bisect.search import BisectSearch, RevisionRunner
 
     if expression is not None and shell is not None:
         raise click.UsageError("give --check or --run, not both")
@@ -145,7 +143,7 @@ def bisect(
 
 
 def _check(expression: str | None, shell: str | None, processes: Processes) -> RevisionCheck | None:
-    from rsltrace.search.bisect.runs import command_check, expression_check
+    from rsltrace.search.bisect.search import command_check, expression_check
 
     if expression is not None:
         return expression_check(expression)
@@ -202,7 +200,7 @@ def _untracked(repository: GitRepository, job: Job | None, files: list[Path]) ->
 def _same_everywhere(repository: GitRepository, job: Job) -> Iterator[str]:
     """Yield notes on code that is the same at every revision because of where it is loaded from."""
     from rsltrace.replay.code import job_code_files, module_file
-    from rsltrace.search.bisect.runs import python_folders
+    from rsltrace.search.bisect.search import python_folders
 
     relative = [path for path in job.search_path if not os.path.isabs(path)]
     folders = [*map(str, python_folders(repository)), *(str(job.resolve(p)) for p in relative)]

@@ -33,8 +33,8 @@ from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.code import code_place, code_places, output_places, places_text
+from rsltrace.trace.words.entities import flag_names
 from rsltrace.trace.words.events import EventWords
-from rsltrace.trace.words.kinds import flag_names
 from rsltrace.trace.words.logs import log_record
 from rsltrace.trace.words.phrases import notes_on, path_word
 

@@ -14,7 +14,7 @@ from rsltrace.cli.output.text_file import write_text
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceError, TraceFormatError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.exports.output_file import check_not_input
+from rsltrace.trace.model.regular_file import check_not_input
 from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:

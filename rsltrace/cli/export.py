@@ -77,8 +77,8 @@ def export(
         raise click.UsageError("--topic and --exclude need --bag or --layout")
     from rsltrace.cli.output.search_progress import working
     from rsltrace.trace.exports.layout import export_layout
-    from rsltrace.trace.exports.output_file import check_output_file
     from rsltrace.trace.exports.perfetto import export_perfetto, require_perfetto
+    from rsltrace.trace.model.regular_file import check_output_file
     from rsltrace.trace.reader import Trace
     from rsltrace.trace.recordings.export import check_bag_folder, export_bag
 

@@ -13,7 +13,7 @@ from rsltrace.cli.options import complete_files
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import TraceError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.exports.output_file import check_not_input
+from rsltrace.trace.model.regular_file import check_not_input
 from rsltrace.trace.model.texts import printable
 
 _BAD_LINES_MAX = 10

@@ -17,7 +17,6 @@ import click
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.terminal import say, terminal_width
 from rsltrace.trace.contents import TraceCounts, count_trace
-from rsltrace.trace.exports.output_file import check_not_input
 from rsltrace.trace.format import (
     EVENTS_PER_SEGMENT,
     FORMAT_VERSION,
@@ -28,6 +27,7 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.finding import decode_drops, decode_unseen, decode_waits, unseen_notes
 from rsltrace.trace.model.operation import is_built_in
+from rsltrace.trace.model.regular_file import check_not_input
 from rsltrace.trace.model.texts import (
     NS_PER_S,
     format_duration,
@@ -39,7 +39,7 @@ from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.timings import DurationStatistics, busy_threads, callback_figures
 from rsltrace.trace.words.code import entity_places, places_text
-from rsltrace.trace.words.kinds import kind_label
+from rsltrace.trace.words.entities import kind_label
 from rsltrace.trace.words.phrases import table
 
 _NO_DIGEST = "none: no two native runs have the same times"

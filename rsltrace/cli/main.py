@@ -49,6 +49,7 @@ _COMMANDS = {
 command like it."""
 
 _IN_MODULE_OF = {
+    "audit": "check",
     "why": "cat",
     "flaky": "explore",
     "rerun": "export",

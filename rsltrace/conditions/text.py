@@ -26,7 +26,7 @@ from functools import partial
 
 from rsltrace.conditions.condition import ActiveCondition, EventCondition
 from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.names import RunNames
+from rsltrace.conditions.names import RunNames, topic_of, with_topic_prefix
 from rsltrace.conditions.occurrences import (
     EntityCondition,
     ExceptionCondition,
@@ -43,7 +43,6 @@ from rsltrace.conditions.occurrences import (
     says_pattern,
     says_words,
 )
-from rsltrace.conditions.topic_fields import topic_of, with_topic_prefix
 from rsltrace.conditions.view import PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.job.values.times import parse_time_in_run

@@ -1,7 +1,9 @@
-"""What the guard asks of the simulation, and what it keeps for one run: pace and random streams."""
+"""Which guard is engaged, what it asks of the simulation, and what it keeps for one run: pace and
+random streams."""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from random import Random
@@ -9,6 +11,42 @@ from typing import Any, Protocol
 
 from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.finding import GuardPolicy
+
+thread_id = copy_of(threading.get_ident)
+_engaged: list[Any] = []
+
+
+def engaged() -> Any:
+    """Return the guard engaged in the calling thread (never in a child process), or None."""
+    if _engaged:
+        guard = _engaged[-1]
+        if guard.thread == thread_id():
+            return guard
+    return None
+
+
+class engage:  # noqa: N801  (used like a function)
+    """Engage ``guard`` in this thread for the block (None: no guard)."""
+
+    __slots__ = ("_before", "_guard")
+
+    def __init__(self, guard: Any) -> None:
+        self._guard = guard
+        self._before: list[Any] = []
+
+    def __enter__(self) -> None:
+        if self._guard is None:
+            self._before = _engaged[:]
+            _engaged.clear()
+        else:
+            _engaged.append(self._guard)
+
+    def __exit__(self, *error: object) -> None:
+        if self._guard is None:
+            _engaged[:] = self._before
+        else:
+            _engaged.remove(self._guard)
+
 
 # Simulated time passes as fast as real time while code waits for something outside of the run.
 

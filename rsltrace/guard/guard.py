@@ -14,7 +14,6 @@ from typing import Any, NoReturn
 from weakref import WeakKeyDictionary
 
 from rsltrace.errors import GuardError
-from rsltrace.guard import engagement
 from rsltrace.guard.callers import (
     FILE_OWNERS,
     OURS,
@@ -26,7 +25,9 @@ from rsltrace.guard.callers import (
     user_frame,
     user_stack,
 )
-from rsltrace.guard.context import RandomStreams, RealTimePace, SimulationContext
+from rsltrace.guard.context import RandomStreams, RealTimePace, SimulationContext, thread_id
+from rsltrace.guard.context import engage as engage
+from rsltrace.guard.context import engaged as _engaged
 from rsltrace.guard.descriptor_table import DescriptorTable
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.libraries import present_import
@@ -158,7 +159,7 @@ class Guard:
         self.answers_random = (
             self.modes is not None and self.modes[NondeterminismSource.RANDOM] is GuardMode.VIRTUAL
         )
-        self.thread = engagement.thread_id()
+        self.thread = thread_id()
         self.process = _process_id()
         _guards[self] = None
         self._event = -1
@@ -494,5 +495,4 @@ def _refuse(source: NondeterminismSource, call: str, where: str) -> NoReturn:
     )
 
 
-engaged: Callable[[], Guard | None] = engagement.engaged
-engage = engagement.engage
+engaged: Callable[[], Guard | None] = _engaged

@@ -20,7 +20,7 @@ from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
 
-from rsltrace.guard.engagement import engage
+from rsltrace.guard.context import engage
 
 # What an installed package does while it is imported is no part of the run. It may find a cache
 # that the run before had to build, with a thread, a program or a wait. So an import has its own

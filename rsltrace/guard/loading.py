@@ -15,7 +15,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-from rsltrace.guard.engagement import engage
+from rsltrace.guard.context import engage
 
 apart: list[Callable[[], AbstractContextManager[None]]] = [partial(engage, None)]
 """Contexts in which Python's own modules and numpy's are loaded, as they are before a run: others

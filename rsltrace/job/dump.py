@@ -12,7 +12,7 @@ from rsltrace.job.fields import JobFields
 from rsltrace.job.parts.guard import resolved_guard
 from rsltrace.job.parts.node import NodeSpec
 from rsltrace.job.parts.part import JobPart
-from rsltrace.job.values.target import target_text
+from rsltrace.job.values.checks import target_text
 from rsltrace.job.values.times import format_time
 
 

@@ -12,7 +12,7 @@ from typing import Protocol
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 from rsltrace.checks.evaluate import property_of, title
-from rsltrace.conditions.topic_fields import topic_of, with_topic_prefix
+from rsltrace.conditions.names import topic_of, with_topic_prefix
 from rsltrace.conditions.view import SentOutput
 from rsltrace.errors import RsltraceError
 from rsltrace.job import Job

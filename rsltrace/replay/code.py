@@ -14,7 +14,7 @@ from typing import Any
 from rsltrace.adapters.workspace.installs import installed_files, module_folders
 from rsltrace.errors import JobError
 from rsltrace.job import Job
-from rsltrace.job.values.target import target_text
+from rsltrace.job.values.checks import target_text
 from rsltrace.run.plans.executables import executable_file, executable_source
 from rsltrace.source_packages import source_packages
 from rsltrace.trace.model.module_search import find_module

@@ -26,7 +26,7 @@ from rsltrace.guard.callers import is_rsltrace_module, is_user_file
 from rsltrace.guard.pin import HASH_SEED, import_threadpoolctl
 from rsltrace.job import Job
 from rsltrace.job.reading.substitute import installed_prefixes
-from rsltrace.job.values.target import Target
+from rsltrace.job.values.checks import Target
 from rsltrace.run.plans.executables import executable_file
 from rsltrace.run.process import COPIED_FILES, is_below, is_pytest_module, run_as_main, user_modules
 from rsltrace.trace.format import (

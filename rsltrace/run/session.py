@@ -105,10 +105,10 @@ from rsltrace.trace.writer import TraceWriter
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.entry import JobEntry
     from rsltrace.adapters.rclpy.faults import NodeFaults
+    from rsltrace.adapters.rclpy.handles.node_state import StateSamples
     from rsltrace.adapters.rclpy.world import World
-    from rsltrace.run.state_samples import StateSamples
+    from rsltrace.run.plans.recorded_order import RecordedOrderObserver
     from rsltrace.simulation.chance.channel import NetworkPlan
-    from rsltrace.simulation.middleware.events.recorded_order_observer import RecordedOrderObserver
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
@@ -367,7 +367,7 @@ class RunSession:
         recorder = Recorder(writer, keep_payload=self._payload_filter())
         self.world.domain.dispatcher.record(recorder)
         if self._observer.samples_states:
-            from rsltrace.run.state_samples import StateSamples
+            from rsltrace.adapters.rclpy.handles.node_state import StateSamples
 
             self._samples = StateSamples(self.world.domain.dispatcher)
             self.world.domain.dispatcher.add_observer(self._samples)

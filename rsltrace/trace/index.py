@@ -28,7 +28,6 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.mcap import chunk as mcap_chunk
 from rsltrace.trace.mcap import reader as mcap_reader
-from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.records import (
     CHUNK_BYTES_MAX,
     MAGIC,
@@ -41,6 +40,7 @@ from rsltrace.trace.mcap.records import (
     RecordFields,
     RecordSpan,
     TruncatedFile,
+    crc32,
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource

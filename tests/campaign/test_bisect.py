@@ -20,7 +20,7 @@ from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import ConditionError, RsltraceError
 from rsltrace.job import load_job
 from rsltrace.search.bisect.repository import GitRepository, Worktree
-from rsltrace.search.bisect.runs import python_folders
+from rsltrace.search.bisect.search import python_folders
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

@@ -23,7 +23,7 @@ from rsltrace.diff import diff_files
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.kinds import SHORT_KINDS
+from rsltrace.trace.words.entities import SHORT_KINDS
 from tests.pages.page import MARKUP, Page, contained, with_names
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"

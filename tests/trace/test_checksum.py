@@ -9,7 +9,7 @@ import zlib
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.trace.mcap.checksum import crc32, crc_of, joined_crc
+from rsltrace.trace.mcap.records import crc32, crc_of, joined_crc
 
 
 @given(st.lists(st.binary(max_size=300), max_size=5), st.integers(0, 2**32 - 1))
@@ -26,7 +26,7 @@ def test_it_is_zlibs_and_that_of_the_parts(parts: list[bytes], before: int) -> N
 def test_it_is_zlibs_where_the_fast_one_is_not_installed() -> None:
     code = (
         "import sys, zlib; sys.modules['zlib_ng'] = None\n"
-        "from rsltrace.trace.mcap.checksum import crc32\n"
+        "from rsltrace.trace.mcap.records import crc32\n"
         "assert crc32 is zlib.crc32"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

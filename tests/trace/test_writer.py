@@ -24,7 +24,7 @@ from rsltrace.trace.format import (
     OUTPUTS_PER_SEGMENT,
     PAYLOAD_BYTES_PER_CHUNK,
 )
-from rsltrace.trace.mcap.checksum import crc_of, joined_crc
+from rsltrace.trace.mcap.records import crc_of, joined_crc
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.reader import Trace

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.terminal import follow
-from rsltrace_viewer.terminal.screens.pick import PickScreen
+from rsltrace_viewer.terminal.screens.text import PickScreen
 from trace_maker import Opened, boundaries, write_run
 
 from rsltrace.errors import TraceError

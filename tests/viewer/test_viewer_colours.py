@@ -12,7 +12,7 @@ from textual.color import Color
 
 from rsltrace.cli.output.graph_svg import graph_svg
 from rsltrace.simulation.middleware.overview import GraphNode, GraphOverview
-from rsltrace.trace.words.node_colours import NODE_COLOURS, node_colours
+from rsltrace.trace.words.entities import NODE_COLOURS, node_colours
 
 Drive = Callable[..., None]
 

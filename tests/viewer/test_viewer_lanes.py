@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from rsltrace_viewer.model.lane_maker import LaneMaker
-from rsltrace_viewer.model.lane_window import LaneWindow
+from rsltrace_viewer.model.lane_maker import LaneMaker, LaneWindow
 from rsltrace_viewer.model.lanes import Lanes, axis_text, drawn
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.view import (

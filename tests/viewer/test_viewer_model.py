@@ -14,7 +14,7 @@ from rsltrace_viewer.model.folder import Bookmarks, VisitedEvents
 from rsltrace_viewer.model.inspector.effects import effects_of
 from rsltrace_viewer.model.inspector.event import inspect
 from rsltrace_viewer.model.inspector.message_tree import Openness, Role
-from rsltrace_viewer.model.lane_window import LaneWindow
+from rsltrace_viewer.model.lane_maker import LaneWindow
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.rows import FilteredRows
 from rsltrace_viewer.model.run import Run

@@ -17,17 +17,16 @@ from rsltrace.trace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.native import is_native, refuse_native
-from rsltrace.trace.words.node_colours import node_colours
+from rsltrace.trace.words.entities import node_colours
 from rsltrace_viewer.model.chains import Chain, read_chains
-from rsltrace_viewer.model.checks import Checks, read_checks
 from rsltrace_viewer.model.folder import Bookmarks, Event, VisitedEvents
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import inspect
 from rsltrace_viewer.model.inspector.message_tree import Line, Openness
-from rsltrace_viewer.model.lane_window import LaneWindow
+from rsltrace_viewer.model.lane_maker import LaneWindow
 from rsltrace_viewer.model.lanes import Lanes
 from rsltrace_viewer.model.logs import Logs, mark_lanes, read_logs
-from rsltrace_viewer.model.overview import Overview, read_overview
+from rsltrace_viewer.model.overview import Checks, Overview, read_checks, read_overview
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import EventFilter
 from rsltrace_viewer.model.query.parser import parse

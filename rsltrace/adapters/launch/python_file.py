@@ -41,7 +41,7 @@ from rsltrace.adapters.launch.api.basics import (
     as_job_error,
     shown,
 )
-from rsltrace.adapters.launch.api.packages import missing_packages_allowed
+from rsltrace.adapters.launch.api.substitutions import missing_packages_allowed
 from rsltrace.adapters.launch.model import LaunchResult
 from rsltrace.adapters.launch.reader import LaunchFileReader
 from rsltrace.errors import JobError, nearest

@@ -17,7 +17,7 @@ from xml.sax.saxutils import escape
 from rsltrace.errors import SetupError
 from rsltrace.simulation.middleware.overview import GraphEnd, GraphLink, GraphOverview
 from rsltrace.trace.model.texts import printable
-from rsltrace.trace.words.node_colours import NODE_COLOURS, node_colours
+from rsltrace.trace.words.entities import NODE_COLOURS, node_colours
 
 _CHARACTER = 7.3
 _ROW = 54.0

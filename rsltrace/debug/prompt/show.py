@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
-from rsltrace.trace.words.kinds import flag_names
+from rsltrace.trace.words.entities import flag_names
 
 if TYPE_CHECKING:
     from rsltrace.debug.checkpoints import Breakpoint, RunPosition, StopReport

@@ -31,8 +31,7 @@ from rsltrace.diff.sentences.runs import order_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text, notes_text, output_change_text
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds
-from rsltrace.trace.words.entities import EntityKey
-from rsltrace.trace.words.kinds import flag_names
+from rsltrace.trace.words.entities import EntityKey, flag_names
 
 FORMAT = "rsltrace-diff"
 VERSION = 1

@@ -30,7 +30,7 @@ from rsltrace.diff.sentences.divergence import no_event_text
 from rsltrace.diff.sentences.event_differences import event_differences_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
-from rsltrace.trace.words.kinds import flag_names
+from rsltrace.trace.words.entities import flag_names
 from rsltrace.trace.words.phrases import event_title
 
 CONTEXT = 5

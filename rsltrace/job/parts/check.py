@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.part import JobPart, after_fields
 from rsltrace.job.values.checks import (
+    Target,
     attach,
     check,
+    check_callable_target,
     given,
     items,
     number,
@@ -19,7 +21,6 @@ from rsltrace.job.values.checks import (
 )
 from rsltrace.job.values.names import check_node_glob, check_topic
 from rsltrace.job.values.problem import JobProblem, describe
-from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike
 
 # ``latency:`` of a check: how long data may take through a chain of topics.

@@ -7,9 +7,18 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.part import JobPart
-from rsltrace.job.values.checks import Globs, attach, check, flag, part, positive_time, whole
+from rsltrace.job.values.checks import (
+    Globs,
+    Target,
+    attach,
+    check,
+    check_callable_target,
+    flag,
+    part,
+    positive_time,
+    whole,
+)
 from rsltrace.job.values.problem import JobProblem
-from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_size
 from rsltrace.trace.model.event import SEGMENT_EVENTS
 

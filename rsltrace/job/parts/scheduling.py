@@ -10,11 +10,21 @@ from rsltrace.errors import nearest
 from rsltrace.job.parts.distribution import DistributionSpec
 from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.part import JobPart, after_fields
-from rsltrace.job.values.checks import check, items, named_parts, one_of, part, parts, text, whole
+from rsltrace.job.values.checks import (
+    Target,
+    check,
+    check_callable_target,
+    items,
+    named_parts,
+    one_of,
+    part,
+    parts,
+    text,
+    whole,
+)
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_node_glob
 from rsltrace.job.values.problem import JobProblem, describe, meant_by
-from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_time
 
 WHEN_BLOCKED, EVERY_LINE = "when_blocked", "every_line"

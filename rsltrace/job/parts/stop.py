@@ -6,9 +6,16 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from rsltrace.job.parts.field import Field
 from rsltrace.job.parts.part import JobPart
-from rsltrace.job.values.checks import check, part, positive_time, text, whole
+from rsltrace.job.values.checks import (
+    Target,
+    check,
+    check_callable_target,
+    part,
+    positive_time,
+    text,
+    whole,
+)
 from rsltrace.job.values.names import check_field_path, check_topic
-from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_size, parse_time
 
 

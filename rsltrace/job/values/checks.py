@@ -7,7 +7,7 @@ from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any
 
 from rsltrace.errors import nearest
-from rsltrace.job.values.names import check_glob
+from rsltrace.job.values.names import check_glob, check_target, dotted_target
 from rsltrace.job.values.problem import JobProblem, ProblemCollector, as_flag, describe
 from rsltrace.job.values.times import TIME_SCHEMA, parse_time
 
@@ -233,3 +233,29 @@ def _as_list(value: object) -> str:
 
 
 Globs = Annotated[tuple[str, ...], check(items(text(check_glob)))]
+
+
+Target = str | Callable[..., object]
+"""``module:attribute`` as text, or (in Python) the class or function itself."""
+
+
+def target_text(target: Target) -> str:
+    """Return ``module:qualname`` of a target."""
+    if isinstance(target, str):
+        return target
+    kind = type(target)
+    module = getattr(target, "__module__", kind.__module__)
+    return f"{module}:{getattr(target, '__qualname__', kind.__qualname__)}"
+
+
+def check_callable_target(value: object) -> Target:
+    """Check a class or function, given itself, as ``module:attribute`` or as the path of a file
+    in the job's folder, ``file.py:attribute``, which is read as that of its module."""
+    if callable(value):
+        return value
+    if not isinstance(value, str):
+        raise JobProblem(f"expected module:Class or module:function, got {describe(value)}")
+    return text(check_target)(dotted_target(value))
+
+
+attach(check_callable_target, schema={"type": "string", "pattern": check_target.pattern})  # type: ignore[attr-defined]

@@ -19,8 +19,8 @@ from rsltrace.errors import JobError, RunError, SetupError, did_you_mean
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
 from rsltrace.job.job import entry_meant
+from rsltrace.job.values.checks import Target, target_text
 from rsltrace.job.values.problem import Loc
-from rsltrace.job.values.target import Target, target_text
 from rsltrace.run.plans.executables import MainFinder
 from rsltrace.run.plans.processes import ProcessPrograms
 from rsltrace.run.plans.scheduling import load_target

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 
 from rsltrace.errors import OutputError, TraceError
-from rsltrace.trace.exports.output_file import check_output_file
 from rsltrace.trace.format import PREFIX_OWN, TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ROSOUT
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.operation import NODE_TOPICS
-from rsltrace.trace.model.regular_file import replacement_of
+from rsltrace.trace.model.regular_file import check_output_file, replacement_of
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recordings.export import chosen_channels

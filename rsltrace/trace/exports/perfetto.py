@@ -23,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import OutputError, SetupError, TraceError
-from rsltrace.trace.exports.output_file import check_output_file
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import (
     EventKind,
@@ -33,15 +32,14 @@ from rsltrace.trace.model.event import (
     decision_duration,
 )
 from rsltrace.trace.model.finding import GuardMode
-from rsltrace.trace.model.regular_file import replacement_of
+from rsltrace.trace.model.regular_file import check_output_file, replacement_of
 from rsltrace.trace.model.texts import NS_PER_S, printable, shortened
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import output_of
 from rsltrace.trace.timings import iterate_timings
-from rsltrace.trace.words.entities import RUN_NAME
+from rsltrace.trace.words.entities import RUN_NAME, kind_label
 from rsltrace.trace.words.events import EventWords
-from rsltrace.trace.words.kinds import kind_label
 
 _EVENTS_AHEAD = 32 * 4096
 """How far effects of an event are looked for. A later one has no arrow from its cause."""

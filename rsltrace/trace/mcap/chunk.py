@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.records import (
     CHUNK_BYTES_MAX,
     MESSAGE,
@@ -17,6 +16,7 @@ from rsltrace.trace.mcap.records import (
     RECORD_HEAD,
     DamageError,
     RecordSpan,
+    crc32,
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource

@@ -10,7 +10,6 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.records import (
     MAGIC,
     RECORD_BYTES_MAX,
@@ -25,6 +24,7 @@ from rsltrace.trace.mcap.records import (
     RecordFields,
     RecordSpan,
     TruncatedFile,
+    crc32,
     parse_channel,
     parse_chunk_index,
     parse_header,

@@ -17,9 +17,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from rsltrace.errors import OutputError
-from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.descriptor import PrivateDescriptor
-from rsltrace.trace.mcap.records import MAGIC
+from rsltrace.trace.mcap.records import MAGIC, crc32
 
 if sys.platform != "win32":
     import fcntl

@@ -17,7 +17,6 @@ import zstandard
 from mcap.opcode import Opcode
 
 from rsltrace.errors import OutputError
-from rsltrace.trace.mcap.checksum import crc32, crc_of, joined_crc
 from rsltrace.trace.mcap.chunk_builder import ChunkBody
 from rsltrace.trace.mcap.records import (
     MAGIC,
@@ -26,6 +25,9 @@ from rsltrace.trace.mcap.records import (
     SCHEMA_ENCODING,
     McapChannel,
     McapSchema,
+    crc32,
+    crc_of,
+    joined_crc,
 )
 from rsltrace.trace.mcap.sink import Sink
 

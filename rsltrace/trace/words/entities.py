@@ -1,12 +1,15 @@
-"""Names of entities: by their ids in one trace, and independent of ids."""
+"""Names of entities, by their ids in one trace and independent of ids; words for kinds and flags;
+a colour for each node."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
+from zlib import crc32
 
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.texts import printable
 
 LOG_LEVELS = {"debug": 10, "info": 20, "warn": 30, "warning": 30, "error": 40, "fatal": 50}
@@ -83,3 +86,67 @@ class EntityNames:
     @property
     def longest_name(self) -> int:
         return max(len(name) for _, name in self._names.values())
+
+
+NODE_COLOURS = (
+    ("#76e2e3", "#086869"),
+    ("#b4cffe", "#2855ad"),
+    ("#ebb9f7", "#7e388e"),
+    ("#cfc5fe", "#6044a6"),
+    ("#719def", "#032e84"),
+    ("#2eabe1", "#063d54"),
+    ("#c282d0", "#570c66"),
+    ("#a28ee8", "#3f1c7c"),
+)
+"""For a dark and for a light background. Red, amber and green are left out: they mean that runs
+differ."""
+
+
+def node_colours(names: Iterable[str]) -> dict[str, int]:
+    """Return the colour of each node, its place in ``NODE_COLOURS``.
+
+    It follows from the name; of two nodes with the same one, the later name takes the next that is
+    free.
+    """
+    count, found, used = len(NODE_COLOURS), dict[str, int](), set[int]()
+    for name in sorted(set(names)):
+        wanted = crc32(name.encode(errors="replace")) % count
+        order = [*range(wanted, count), *range(wanted)]
+        found[name] = next((one for one in order if one not in used), wanted)
+        used.add(found[name])
+    return found
+
+
+SHORT_KINDS = {
+    EventKind.CONSTRUCT: "init",
+    EventKind.TIMER: "timer",
+    EventKind.SUBSCRIPTION: "sub",
+    EventKind.SERVICE: "srv",
+    EventKind.CLIENT: "client",
+    EventKind.GUARD_CONDITION: "guard",
+    EventKind.TASK: "task",
+    EventKind.RESUME: "resume",
+    EventKind.QOS_EVENT: "qos",
+    EventKind.BAG: "bag",
+    EventKind.SHUTDOWN: "end",
+    EventKind.ACTION: "action",
+    EventKind.CLOCK_JUMP: "jump",
+    EventKind.OUTSIDE: "driver",
+    EventKind.FAULT: "fault",
+}
+"""Kinds of events in at most six letters, for narrow columns."""
+
+_FLAGS = tuple((flag, str(flag.name).lower()) for flag in EventFlag if flag)
+
+
+def kind_label(kinds: type[EventKind] | type[OutputKind], number: int) -> str:
+    """Return the name of a kind; ``kind 99`` for one of a newer rsltrace."""
+    try:
+        return kinds(number).label
+    except ValueError:
+        return f"kind {number}"
+
+
+def flag_names(flags: int) -> list[str]:
+    """Return the names of flags: ``raised``, ``suspended``."""
+    return [name for flag, name in _FLAGS if flags & flag]

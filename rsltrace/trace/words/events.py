@@ -18,8 +18,7 @@ from rsltrace.trace.model.event import (
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.entities import EntityNames
-from rsltrace.trace.words.kinds import kind_label
+from rsltrace.trace.words.entities import EntityNames, kind_label
 from rsltrace.trace.words.logs import log_record
 from rsltrace.trace.words.phrases import exception_of
 

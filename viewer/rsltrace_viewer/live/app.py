@@ -20,7 +20,7 @@ from rsltrace_viewer.live.execution import WATCHES_MAX, Executed, Execution, Liv
 from rsltrace_viewer.live.state import LiveSession
 from rsltrace_viewer.terminal.app import ViewerApp
 from rsltrace_viewer.terminal.keys import LIVE_KEYS
-from rsltrace_viewer.terminal.screens.pick import PickScreen
+from rsltrace_viewer.terminal.screens.text import PickScreen
 from rsltrace_viewer.terminal.widgets.prompt import Prompt, Question
 
 # What a live screen has besides: the breakpoints.

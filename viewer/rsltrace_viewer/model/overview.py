@@ -1,14 +1,17 @@
-"""A run at a glance: what went wrong, nodes and topics with their rates, where the time goes."""
+"""A run at a glance: what went wrong, nodes and topics with their rates, where the time goes,
+and what came of its checks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import field
+from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.errors import TraceError
+from rsltrace.errors import RsltraceError, TraceError
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.contents import Occurrences, add_occurrences
 from rsltrace.trace.model.entity import EntityKind
@@ -24,6 +27,9 @@ from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.logs import LEVEL_WARN, silent_topics
 from rsltrace_viewer.model.logs import Logs, first_event
 from rsltrace_viewer.model.run import Run, Segment
+
+if TYPE_CHECKING:
+    from rsltrace.checks.evaluate import CheckResult
 
 _LEVEL_ERROR = 40
 _DRAW = int(OutputKind.DRAW)
@@ -288,3 +294,37 @@ def troubles_of(run: Run, overview: Overview, logs: Logs | None) -> list[Trouble
 def unheard_of(run: Run) -> str:
     """Return what is listened to and never published, in a sentence; empty if there is none."""
     return silent_topics(run.entities.values())
+
+
+_STEP_S = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Checks:
+    """The checks that were violated, how many passed, and why none could be held against the run,
+    if so."""
+
+    violated: tuple[CheckResult, ...] = ()
+    passed: int = 0
+    error: str = ""
+
+
+def read_checks(run: Run) -> Iterator[Checks]:
+    """Hold the checks of a run's job against it: yield now and then, and in the end what came of
+    them; nothing if the job has none, or the run is not finished. Functions are not called, since
+    a trace may come from anybody."""
+    if not run.trace.complete or "checks" not in run.trace.job_text:
+        return
+    from rsltrace.checks.evaluate import PASSED, VIOLATED, evaluating, job_of_checks
+
+    try:
+        last = perf_counter()
+        for results in evaluating(run.trace, job_of_checks(run.trace)):
+            if results:
+                violated = tuple(one for one in results if one.verdict == VIOLATED)
+                yield Checks(violated, sum(one.verdict == PASSED for one in results))
+            elif perf_counter() - last > _STEP_S:
+                yield Checks()
+                last = perf_counter()
+    except RsltraceError as error:
+        yield Checks(error=str(error).splitlines()[0])

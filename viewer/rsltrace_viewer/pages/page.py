@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from rsltrace.trace.model.texts import printable_lines, shortened
-from rsltrace.trace.words.node_colours import NODE_COLOURS
+from rsltrace.trace.words.entities import NODE_COLOURS
 
 _FOLDER = Path(__file__).parent / "templates"
 _TEXT_MAX, _REPORT_MAX = 4000, 100_000

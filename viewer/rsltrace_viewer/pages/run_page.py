@@ -18,9 +18,9 @@ from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.logs import LEVEL_WARN
 from rsltrace.trace.words.phrases import path_word
-from rsltrace_viewer.model.checks import Checks
 from rsltrace_viewer.model.logs import Logs, read_logs
 from rsltrace_viewer.model.overview import (
+    Checks,
     OverviewSection,
     callbacks_of,
     nodes_of,

@@ -16,8 +16,7 @@ from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
-from rsltrace.trace.exports.output_file import check_output_file
-from rsltrace.trace.model.regular_file import replacement_of
+from rsltrace.trace.model.regular_file import check_output_file, replacement_of
 from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import notes_on

@@ -9,7 +9,7 @@ from rsltrace_viewer.model.inspector.event import summary_line
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.session import SEEK, Sought
 from rsltrace_viewer.terminal.follow import walk
-from rsltrace_viewer.terminal.screens.pick import PickScreen
+from rsltrace_viewer.terminal.screens.text import PickScreen
 from rsltrace_viewer.terminal.shell import Shell
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
 

@@ -14,8 +14,8 @@ from rsltrace.adapters.launch.api.basics import (
     calling_line,
 )
 from rsltrace.adapters.launch.api.events import later
-from rsltrace.adapters.launch.api.packages import names_missing_package
 from rsltrace.adapters.launch.api.parameters import evaluated_parameters
+from rsltrace.adapters.launch.api.substitutions import names_missing_package
 from rsltrace.adapters.launch.model import (
     LaunchedNode,
     ProcessSettings,

@@ -24,8 +24,7 @@ from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.texts import Stamp, format_duration, format_seconds, printable, shortened
-from rsltrace.trace.words.entities import RUN_NAME
-from rsltrace.trace.words.kinds import SHORT_KINDS
+from rsltrace.trace.words.entities import RUN_NAME, SHORT_KINDS
 from rsltrace_viewer.model.comparison import Comparison
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import event_link, inspect

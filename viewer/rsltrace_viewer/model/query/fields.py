@@ -17,8 +17,7 @@ from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import WITH_TOPIC
 from rsltrace.trace.model.event import NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace.segments import output_of
-from rsltrace.trace.words.entities import LOG_LEVELS, is_named
-from rsltrace.trace.words.kinds import SHORT_KINDS
+from rsltrace.trace.words.entities import LOG_LEVELS, SHORT_KINDS, is_named
 from rsltrace.trace.words.phrases import seconds_text
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import EventFilter, Mask

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.topic_fields import OF_MESSAGE, with_topic_prefix
+from rsltrace.conditions.names import OF_MESSAGE, with_topic_prefix
 from rsltrace.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
 from rsltrace.errors import ConditionError, RsltraceError, near_or_all

@@ -18,8 +18,7 @@ from rsltrace.trace.model.event import (
 )
 from rsltrace.trace.model.operation import PARAMETER_EVENTS
 from rsltrace.trace.model.texts import format_seconds, printable, shortened
-from rsltrace.trace.words.entities import RUN_NAME
-from rsltrace.trace.words.kinds import SHORT_KINDS
+from rsltrace.trace.words.entities import RUN_NAME, SHORT_KINDS
 from rsltrace.trace.words.logs import LEVEL_WARN, log_record
 from rsltrace_viewer.model.run import Run
 

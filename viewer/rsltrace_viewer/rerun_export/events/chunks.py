@@ -17,9 +17,8 @@ from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKin
 from rsltrace.trace.model.texts import NS_PER_S, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import entity_places, places_text
-from rsltrace.trace.words.entities import RUN_NAME
+from rsltrace.trace.words.entities import RUN_NAME, flag_names, kind_label
 from rsltrace.trace.words.events import group_equal, output_text
-from rsltrace.trace.words.kinds import flag_names, kind_label
 from rsltrace_viewer.rerun_export.columns import (
     SIM_TIME,
     Clock,

@@ -16,8 +16,8 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.native import is_native
 from rsltrace_viewer.model.chains import Chain
-from rsltrace_viewer.model.checks import Checks
 from rsltrace_viewer.model.overview import (
+    Checks,
     Overview,
     OverviewSection,
     Times,

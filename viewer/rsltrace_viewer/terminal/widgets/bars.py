@@ -15,7 +15,7 @@ from textual.widget import Widget
 from textual.widgets import Static
 
 from rsltrace.trace.model.texts import printable
-from rsltrace.trace.words.node_colours import NODE_COLOURS
+from rsltrace.trace.words.entities import NODE_COLOURS
 from rsltrace_viewer.model.view import cells, fit, wrap
 from rsltrace_viewer.terminal.keys import footer_keys
 
