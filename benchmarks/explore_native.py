@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace import Job, load_job
+from rsltrace.checks.conditions.names import RunNames
+from rsltrace.checks.conditions.view import SentOutput
 from rsltrace.checks.evaluate import condition, opposite, title, topic_of, with_topic_prefix
 from rsltrace.checks.properties import EventuallyProperty, NeverProperty, RateProperty, RunProperty
-from rsltrace.conditions.names import RunNames
-from rsltrace.conditions.view import SentOutput
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.texts import NS_PER_S
 

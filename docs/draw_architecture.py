@@ -58,7 +58,7 @@ BOXES = (
         388,
         280,
         54,
-        "trace/words · checks/latency · why",
+        "words · checks/latency · diff/why",
         "said; measured; explained",
         READING,
     ),

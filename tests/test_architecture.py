@@ -57,7 +57,8 @@ def test_layers_load_only_what_they_need(module: str, allowed: set[str]) -> None
 def test_the_first_screen_needs_no_conditions_bags_or_latencies() -> None:
     code = (
         "import sys, rsltrace_viewer.terminal.app\n"
-        "late = ('rsltrace.conditions.text', 'rsltrace.trace.recordings', 'rsltrace.checks')\n"
+        "late = 'conditions.text evaluate latency metrics properties'.split()\n"
+        "late = ['rsltrace.trace.recordings', *(f'rsltrace.checks.{name}' for name in late)]\n"
         "print(*[name for name in late if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -315,8 +316,8 @@ RUNS_CODE = {
 """The modules that turn text into code, or could, with what they use and why they may.
 
 None of them is reached by what a trace, a bag or a parameter file says, unless a run was asked for
-(docs/trust.md). Before you add one: expressions have a language (``rsltrace.conditions``), data has
-JSON or CDR.
+(docs/trust.md). Before you add one: expressions have a language (``rsltrace.checks.conditions``),
+data has JSON or CDR.
 """
 _CALLS = {
     *("eval", "exec", "compile", "__import__", "import_module", "run_module", "run_path"),
@@ -613,5 +614,5 @@ def test_what_turns_text_into_code_is_found(source: str) -> None:
 
 def test_the_language_of_conditions_runs_nothing() -> None:
     """It has neither a way to run code nor the modules that could."""
-    root = Path(__file__).parents[1] / "rsltrace/conditions"
+    root = Path(__file__).parents[1] / "rsltrace/checks/conditions"
     assert not any(_turns_into_code(path.read_text("utf-8")) for path in root.glob("*.py"))

@@ -9,6 +9,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsltrace.checks.conditions.condition import ActiveCondition, EventCondition, is_true
+from rsltrace.checks.conditions.expressions import Expression, parse_expression
+from rsltrace.checks.conditions.names import (
+    OF_MESSAGE,
+    RunNames,
+    names_of,
+    topic_of,
+    with_topic_prefix,
+)
+from rsltrace.checks.conditions.occurrences import TopicCondition
+from rsltrace.checks.conditions.text import parse_condition
+from rsltrace.checks.conditions.trace_events import StartOfTrace, TraceEvent, events_of
+from rsltrace.checks.conditions.view import EventView, PausedRun
 from rsltrace.checks.latency.instances import quantile
 from rsltrace.checks.latency.measure import ChainLatency, Latencies, measuring
 from rsltrace.checks.properties import (
@@ -19,13 +32,6 @@ from rsltrace.checks.properties import (
     RunProperty,
     Violation,
 )
-from rsltrace.conditions.condition import ActiveCondition, EventCondition, is_true
-from rsltrace.conditions.expressions import Expression, parse_expression
-from rsltrace.conditions.names import OF_MESSAGE, RunNames, names_of, topic_of, with_topic_prefix
-from rsltrace.conditions.occurrences import TopicCondition
-from rsltrace.conditions.text import parse_condition
-from rsltrace.conditions.trace_events import StartOfTrace, TraceEvent, events_of
-from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError, RsltraceError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec, LatencySpec

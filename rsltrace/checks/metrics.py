@@ -6,8 +6,8 @@ import math
 import numbers
 from dataclasses import dataclass
 
+from rsltrace.checks.conditions.run_expression import RunExpression
 from rsltrace.checks.evaluate import LoadFunction
-from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import CheckError, ConditionError, JobError, RsltraceError
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.check import MetricSpec

@@ -8,9 +8,9 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from rsltrace.conditions.condition import ActiveCondition, error_text, shown
-from rsltrace.conditions.expressions import Expression
-from rsltrace.conditions.view import EventView
+from rsltrace.checks.conditions.condition import ActiveCondition, error_text, shown
+from rsltrace.checks.conditions.expressions import Expression
+from rsltrace.checks.conditions.view import EventView
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds

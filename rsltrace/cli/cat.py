@@ -39,7 +39,7 @@ from rsltrace.trace.words.logs import log_record
 from rsltrace.trace.words.phrases import notes_on, path_word
 
 if TYPE_CHECKING:
-    from rsltrace.conditions.trace_events import TraceCondition
+    from rsltrace.checks.conditions.trace_events import TraceCondition
     from rsltrace.job.values.times import TimeInRun
 
 
@@ -316,7 +316,7 @@ def cat(
 
 
 def _condition(text: str, trace: Trace) -> TraceCondition:
-    from rsltrace.conditions.trace_events import TraceCondition
+    from rsltrace.checks.conditions.trace_events import TraceCondition
 
     return TraceCondition(text, trace)
 
@@ -466,9 +466,9 @@ def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) 
     Exit status: 0 if the callback ran as expected, 1 if there is a reason why it did not, 2 if
     there is no such node, topic or callback.
     """
-    from rsltrace.why.answer import AsExpected, answer_lines
-    from rsltrace.why.answer import as_json as reason_json
-    from rsltrace.why.answer import why as find_reason
+    from rsltrace.diff.why.answer import AsExpected, answer_lines
+    from rsltrace.diff.why.answer import as_json as reason_json
+    from rsltrace.diff.why.answer import why as find_reason
 
     with Trace.open(trace) as opened:
         tell_notes(notes_on(opened))

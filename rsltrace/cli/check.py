@@ -78,9 +78,9 @@ def check(
     Exit status: 0 if there are no problems, 1 if a check fails or the graph has a problem, 2 if
     the job cannot run.
     """
+    from rsltrace.checks.conditions.names import RunNames, loaded_fields
     from rsltrace.checks.evaluate import check_texts, wrong_checks
     from rsltrace.checks.metrics import check_metrics
-    from rsltrace.conditions.names import RunNames, loaded_fields
     from rsltrace.diff.file_kind import is_trace
     from rsltrace.run.checking import check_job
 

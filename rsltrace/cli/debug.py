@@ -70,7 +70,7 @@ def debug(
     Exit status: 0 when the session ends, 1 if the run diverged from TRACE, 2 for an error: the
     session could not start, or a command of a script failed.
     """
-    from rsltrace.conditions.names import names_of
+    from rsltrace.checks.conditions.names import names_of
     from rsltrace.debug.client import DebugSession
     from rsltrace.debug.prompt.shell import DebugPrompt
     from rsltrace.diff.file_kind import is_trace

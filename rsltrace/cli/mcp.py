@@ -45,10 +45,10 @@ def mcp(trust: bool, folders: tuple[Path, ...], limit_s: float) -> None:
     \b
     Needs the package mcp: pip install 'rsltrace[mcp]'
     """
-    from rsltrace.mcp_server.access import Access
+    from rsltrace.cli.mcp_server.access import Access
 
     try:
-        from rsltrace.mcp_server.server import serve
+        from rsltrace.cli.mcp_server.server import serve
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("mcp", "anyio"):  # which mcp brings
             raise

@@ -15,7 +15,7 @@ from rsltrace.adapters.rclpy.concurrency.coroutines import TaskRun
 from rsltrace.adapters.rclpy.concurrency.threads import SimThread
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
-from rsltrace.conditions.view import SentOutput
+from rsltrace.checks.conditions.view import SentOutput
 from rsltrace.trace.format import EVENT_REST
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds

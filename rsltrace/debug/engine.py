@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.conditions.names import RunNames, loaded_fields, names_of
-from rsltrace.conditions.text import parse_condition
+from rsltrace.checks.conditions.names import RunNames, loaded_fields, names_of
+from rsltrace.checks.conditions.text import parse_condition
 from rsltrace.debug import inspection
 from rsltrace.debug.current_event import NO_CALL, CallbackCall, CurrentEventView, call_of
 from rsltrace.debug.debuggers import make_debugger

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from rsltrace.conditions.condition import ActiveCondition, EventCondition
-from rsltrace.conditions.names import RunNames
-from rsltrace.conditions.text import parse_condition
-from rsltrace.conditions.view import EventView
+from rsltrace.checks.conditions.condition import ActiveCondition, EventCondition
+from rsltrace.checks.conditions.names import RunNames
+from rsltrace.checks.conditions.text import parse_condition
+from rsltrace.checks.conditions.view import EventView
 from rsltrace.debug.current_event import CurrentEventView
 from rsltrace.line_protocol import Message
 

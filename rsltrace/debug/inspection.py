@@ -14,16 +14,21 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.adapters.processes.process import Process
-from rsltrace.conditions.evaluation import TextPositions, UnsupportedExpression, field_names, parsed
-from rsltrace.conditions.expressions import (
+from rsltrace.checks.conditions.evaluation import (
+    TextPositions,
+    UnsupportedExpression,
+    field_names,
+    parsed,
+)
+from rsltrace.checks.conditions.expressions import (
     check_names,
     free_names,
     message_of,
     no_such_field,
     node_named,
 )
-from rsltrace.conditions.names import RunNames
-from rsltrace.conditions.view import EventView
+from rsltrace.checks.conditions.names import RunNames
+from rsltrace.checks.conditions.view import EventView
 from rsltrace.debug.current_event import CurrentEventView, source
 from rsltrace.errors import ConditionError, DebugError, did_you_mean, near_or_all
 from rsltrace.simulation.middleware.entity import Receiver
@@ -36,7 +41,7 @@ if TYPE_CHECKING:
 
 # ``print EXPRESSION`` and ``DebugSession.evaluate`` take Python from the user at the prompt, in a
 # copy of a run whose code they trust: it may call methods of nodes. Text from files is never
-# evaluated so: conditions, checks and metrics have their own language (``rsltrace.conditions``).
+# evaluated so: conditions, checks and metrics have a language (``rsltrace.checks.conditions``).
 
 _HARMLESS = (
     "abs all any bool bytes chr dict divmod enumerate float format frozenset getattr hasattr hash "

@@ -152,7 +152,7 @@ class Supervisor:
         return {"index": cause + 1, "stamp_ns": sender["stamp_ns"], "event": sender}
 
     def _last_changed(self, request: Message) -> Message:
-        from rsltrace.conditions.occurrences import NOT_THERE
+        from rsltrace.checks.conditions.occurrences import NOT_THERE
 
         name = self._node(request)
         text = f"watch node({name!r}).{request['attribute']}"

@@ -11,9 +11,9 @@ from typing import Protocol
 
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
+from rsltrace.checks.conditions.names import topic_of, with_topic_prefix
+from rsltrace.checks.conditions.view import SentOutput
 from rsltrace.checks.evaluate import property_of, title
-from rsltrace.conditions.names import topic_of, with_topic_prefix
-from rsltrace.conditions.view import SentOutput
 from rsltrace.errors import RsltraceError
 from rsltrace.job import Job
 from rsltrace.job.parts.check import CheckSpec

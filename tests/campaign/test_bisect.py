@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
+from rsltrace.checks.conditions.run_expression import RunExpression
 from rsltrace.cli.bisect import _same_everywhere
-from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import ConditionError, RsltraceError
 from rsltrace.job import load_job
 from rsltrace.search.bisect.repository import GitRepository, Worktree

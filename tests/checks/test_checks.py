@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace import CheckResult, Job, NodeSpec, Trace, evaluate_checks, load_job, measure_latencies
+from rsltrace.checks.conditions.condition import ActiveCondition
 from rsltrace.checks.properties import EventuallyProperty, NeverProperty, RateProperty, RunProperty
 from rsltrace.cli.main import cli
-from rsltrace.conditions.condition import ActiveCondition
 from rsltrace.errors import CheckError, JobError
 
 SAMPLE = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback"
@@ -250,7 +250,7 @@ class _Event:
         self.index, self.stamp_ns, self.letters = index, stamp_ns, letters
 
     def sent(self) -> Sequence[Any]:
-        from rsltrace.conditions.view import SentOutput
+        from rsltrace.checks.conditions.view import SentOutput
 
         return [SentOutput(1, letter, 0) for letter in self.letters]
 

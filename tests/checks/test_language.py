@@ -16,11 +16,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace import Trace, evaluate_checks
+from rsltrace.checks.conditions.bounds import INT_BITS_MAX, STEPS_MAX, LimitError, StepBudget
+from rsltrace.checks.conditions.expressions import parse_expression
+from rsltrace.checks.conditions.run_expression import RunExpression
+from rsltrace.checks.conditions.text import parse_condition
 from rsltrace.checks.evaluate import job_of_checks
-from rsltrace.conditions.bounds import INT_BITS_MAX, STEPS_MAX, LimitError, StepBudget
-from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.run_expression import RunExpression
-from rsltrace.conditions.text import parse_condition
 from rsltrace.errors import CheckError, ConditionError
 from tests.trace.make import write_run
 
@@ -328,7 +328,7 @@ def test_a_large_sequence_is_paid_for() -> None:
 
 @pytest.mark.parametrize("pattern", ["(a+)+$", "(a|a)+$", "a*a*a*a*a*a*a*a*a*b"])
 def test_no_pattern_of_logs_keeps_a_check_busy(pattern: str) -> None:
-    from rsltrace.conditions.view import SentOutput
+    from rsltrace.checks.conditions.view import SentOutput
     from rsltrace.trace.model.event import OutputKind
 
     @dataclass

@@ -524,7 +524,7 @@ _HEAVY = (
         (
             ["info", "a.mcap"],
             (
-                *("rsltrace.diff", "rsltrace.conditions", "rsltrace.trace.decode"),
+                *("rsltrace.diff", "rsltrace.checks.conditions", "rsltrace.trace.decode"),
                 *("rsltrace.replay", "rsltrace.job"),
             ),
         ),
@@ -532,14 +532,18 @@ _HEAVY = (
             ["cat", "a.mcap"],
             (
                 *("rsltrace.diff", "rsltrace.replay", "rsltrace.trace.decode"),
-                *("rsltrace.conditions", "rsltrace.job"),
+                *("rsltrace.checks.conditions", "rsltrace.job"),
             ),
         ),
         (
             ["diff", "a.mcap", "a.mcap"],
             (
                 *("rsltrace.diff.causes", "rsltrace.diff.traces.comparison", "rsltrace.diff.bags"),
-                *("rsltrace.diff.alignment.align", "rsltrace.conditions", "rsltrace.trace.decode"),
+                *(
+                    "rsltrace.diff.alignment.align",
+                    "rsltrace.checks.conditions",
+                    "rsltrace.trace.decode",
+                ),
                 *("numpy", "rsltrace.trace.segments", "rsltrace.cli.output.search_progress"),
             ),
         ),

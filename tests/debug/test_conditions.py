@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.conditions.condition import ActiveCondition, EventCondition
-from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.names import RunNames, loaded_fields
-from rsltrace.conditions.text import parse_condition
-from rsltrace.conditions.view import SentOutput
+from rsltrace.checks.conditions.condition import ActiveCondition, EventCondition
+from rsltrace.checks.conditions.expressions import parse_expression
+from rsltrace.checks.conditions.names import RunNames, loaded_fields
+from rsltrace.checks.conditions.text import parse_condition
+from rsltrace.checks.conditions.view import SentOutput
 from rsltrace.errors import ConditionError
 from rsltrace.trace.model.event import EventKind, OutputKind
 

@@ -18,12 +18,12 @@ import pytest
 from campaigns.attack import mcap_parts
 from campaigns.attack.families.texts import with_strings
 from rsltrace.child_processes import rsltrace_command
-from rsltrace.mcp_server.access import Access, RefusedError
-from rsltrace.mcp_server.answers import ANSWER_BYTES_MAX, PageKeeper, answer, bounded, page_of
-from rsltrace.mcp_server.commands import CommandResult, run_command
-from rsltrace.mcp_server.server import VERDICTS, job_part
-from rsltrace.mcp_server.sessions import Sessions
-from rsltrace.mcp_server.tools import RUNNING, TOOLS, Tools
+from rsltrace.cli.mcp_server.access import Access, RefusedError
+from rsltrace.cli.mcp_server.answers import ANSWER_BYTES_MAX, PageKeeper, answer, bounded, page_of
+from rsltrace.cli.mcp_server.commands import CommandResult, run_command
+from rsltrace.cli.mcp_server.server import VERDICTS, job_part
+from rsltrace.cli.mcp_server.sessions import Sessions
+from rsltrace.cli.mcp_server.tools import RUNNING, TOOLS, Tools
 from rsltrace.trace.model.texts import printable_lines
 
 from .conftest import Call, converse
@@ -102,7 +102,7 @@ def test_answers_are_short_and_recorded_texts_marked(tmp_path: Path) -> None:
 
 
 def test_trust_and_folders_come_from_the_command_line_alone(tmp_path: Path) -> None:
-    from rsltrace.mcp_server.server import make_server
+    from rsltrace.cli.mcp_server.server import make_server
 
     (tmp_path / "job.yaml").write_text("nodes: [{node: 'os:abort'}]\n")
     (tmp_path / "link.mcap").symlink_to(SAMPLES / "schedule" / "job.yaml")
@@ -165,7 +165,7 @@ def test_a_command_loads_no_module_of_the_working_directory(tmp_path: Path) -> N
 def test_a_trace_cannot_name_files_to_be_shown(tmp_path: Path) -> None:
     from rsltrace_viewer.model.run import Run
 
-    from rsltrace.mcp_server.event_page import _source
+    from rsltrace.cli.mcp_server.event_page import _source
 
     (tmp_path / "robot.py").write_text("first\nsecond\n")
     (tmp_path / "secret.txt").write_text("secret\n")
@@ -360,9 +360,9 @@ def test_no_session_outlives_the_client(how: str, endless: Path) -> None:
 def test_resources_and_prompts() -> None:
     from mcp.server.mcpserver import MCPServer
 
+    from rsltrace.cli.mcp_server.server import make_server
     from rsltrace.diff.facts.causes import Verdict
     from rsltrace.job.documents.schema import job_schema
-    from rsltrace.mcp_server.server import make_server
 
     assert set(VERDICTS) == {verdict.value for verdict in Verdict}
     access = Access((Path.cwd(),), trust=False, limit_s=1)
@@ -386,7 +386,9 @@ def test_without_the_package_it_says_how_to_install_it(
     command: Callable[..., subprocess.CompletedProcess[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "mcp", None)
-    for name in [name for name in sys.modules if name.startswith(("mcp.", "rsltrace.mcp_server."))]:
+    for name in [
+        name for name in sys.modules if name.startswith(("mcp.", "rsltrace.cli.mcp_server."))
+    ]:
         monkeypatch.delitem(sys.modules, name)
     done = command("mcp")
     assert done.returncode == 2

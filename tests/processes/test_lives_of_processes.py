@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
+from rsltrace.checks.conditions.trace_events import TraceCondition
 from rsltrace.checks.evaluate import evaluate_checks
-from rsltrace.conditions.trace_events import TraceCondition
+from rsltrace.diff.why.answer import why
 from rsltrace.errors import ConditionError, JobError, TraceError
 from rsltrace.job import job_from_text, load_job
 from rsltrace.run import RunResult, run
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
-from rsltrace.why.answer import why
 
 pytestmark = pytest.mark.ros
 

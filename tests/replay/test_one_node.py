@@ -12,12 +12,12 @@ import pytest
 import rsltrace
 from rsltrace.checks.latency.flow import MessageFlow
 from rsltrace.checks.latency.paths import ChainSelection
+from rsltrace.diff.why.history import RunHistory
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
-from rsltrace.why.history import RunHistory
 from tests.replay.test_jobs_replay import EXAMPLES, FEATURES
 from tests.run.conftest import TALKER
 from tests.run.test_recorded_order import ALL, MIXED

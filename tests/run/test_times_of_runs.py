@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import rsltrace
-from rsltrace.conditions.names import RunNames
-from rsltrace.conditions.text import parse_condition
+from rsltrace.checks.conditions.names import RunNames
+from rsltrace.checks.conditions.text import parse_condition
 from rsltrace.job import load_job
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.run import run

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsltrace.diff.why.answer import why
+from rsltrace.diff.why.filters import _spread
 from rsltrace.errors import TraceError
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.model.finding import decode_drops
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import exception_of
-from rsltrace.why.answer import why
-from rsltrace.why.filters import _spread
 
 _TOPICS = st.lists(st.lists(st.integers(0, 50), min_size=1, max_size=4), min_size=2, max_size=3)
 

@@ -13,12 +13,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
+from rsltrace.diff.why.answer import why
 from rsltrace.errors import TraceError
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.simulation.middleware.qos.policies import DEFAULT_QOS, Liveliness, Qos, Reliability
 from rsltrace.trace.reader import Trace
-from rsltrace.why.answer import why
 
 pytestmark = pytest.mark.ros
 

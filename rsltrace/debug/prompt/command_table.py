@@ -23,7 +23,7 @@ from rsltrace.terminal import say
 from rsltrace.trace.words.entities import nodes_called
 
 if TYPE_CHECKING:
-    from rsltrace.conditions.names import RunNames
+    from rsltrace.checks.conditions.names import RunNames
     from rsltrace.debug.client import DebugSession
 
 
@@ -487,8 +487,8 @@ def _when(shell: PromptContext, rest: str) -> None:
 
 def _as_condition(text: str, shell: PromptContext) -> str:
     """Return the condition that a text means: an expression is ``when …``."""
-    from rsltrace.conditions.expressions import parse_expression
-    from rsltrace.conditions.text import parse_condition
+    from rsltrace.checks.conditions.expressions import parse_expression
+    from rsltrace.checks.conditions.text import parse_condition
 
     try:
         parse_condition(text, shell.names())

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.conditions.names import RunNames
+from rsltrace.checks.conditions.names import RunNames
 from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO, PromptContext
 from rsltrace.errors import DebugError, RsltraceError

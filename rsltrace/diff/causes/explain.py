@@ -455,7 +455,7 @@ class Explainer:
         self._left_to_explain -= trace.event_count + trace.output_count
         if self._left_to_explain < 0:
             return None
-        from rsltrace.why.answer import why  # most diffs need none of it
+        from rsltrace.diff.why.answer import why  # most diffs need none of it
 
         try:
             reason = why(trace, view.entity.node, view.entity.name, view.stamp_ns)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
+from rsltrace.checks.conditions.run_expression import RunExpression
 from rsltrace.child_processes import OWN_FOLDER, Processes, rsltrace_command
-from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import BisectError, ConditionError
 from rsltrace.search.bisect.repository import Commit, GitRepository, Worktree
 from rsltrace.search.perturb import (

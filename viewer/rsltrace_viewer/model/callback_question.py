@@ -6,14 +6,14 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import replace
 
+from rsltrace.diff.why.answer import answer_lines, why
+from rsltrace.diff.why.question import WITH_CALLBACK
 from rsltrace.errors import TraceError
 from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.words.phrases import path_word, seconds_text
-from rsltrace.why.answer import answer_lines, why
-from rsltrace.why.question import WITH_CALLBACK
 from rsltrace_viewer.model.run import Run
 
 

@@ -20,7 +20,7 @@ from rsltrace.trace.words.logs import log_record
 from rsltrace_viewer.model.run import Run, Segment
 
 if TYPE_CHECKING:
-    from rsltrace.conditions.trace_events import TraceCondition
+    from rsltrace.checks.conditions.trace_events import TraceCondition
 
 Mask = npt.NDArray[np.bool_]
 Ids = npt.NDArray[np.uint32]

@@ -306,7 +306,7 @@ def _read_text(run: Run, token: Token) -> EventFilter:
 
 
 def _read_where(run: Run, token: Token) -> EventFilter:
-    from rsltrace.conditions.trace_events import TraceCondition  # as long as opening a trace
+    from rsltrace.checks.conditions.trace_events import TraceCondition  # as long as opening a trace
 
     try:
         return conditions.Where(TraceCondition(unquoted(token), run.trace))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
-from rsltrace.conditions.names import is_about_messages
+from rsltrace.checks.conditions.names import is_about_messages
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import EventFilter
 from rsltrace_viewer.model.query.fields import FIELDS, MessageText, bare_word

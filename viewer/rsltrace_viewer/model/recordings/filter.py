@@ -13,9 +13,9 @@ from itertools import islice
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.names import OF_MESSAGE, with_topic_prefix
-from rsltrace.conditions.trace_events import StartOfTrace
+from rsltrace.checks.conditions.expressions import parse_expression
+from rsltrace.checks.conditions.names import OF_MESSAGE, with_topic_prefix
+from rsltrace.checks.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
 from rsltrace.errors import ConditionError, RsltraceError, near_or_all
 from rsltrace.fast_dataclass import dataclass

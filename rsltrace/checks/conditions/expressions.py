@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rsltrace.conditions.bounds import StepBudget
-from rsltrace.conditions.evaluation import (
+from rsltrace.checks.conditions.bounds import StepBudget
+from rsltrace.checks.conditions.evaluation import (
     NO_FIELD,
     Evaluate,
     ExpressionContext,
@@ -23,9 +23,9 @@ from rsltrace.conditions.evaluation import (
     parsed,
     value_of,
 )
-from rsltrace.conditions.functions import CONSTANTS, FUNCTIONS, OF_MODULES
-from rsltrace.conditions.names import RunNames, wrong_field
-from rsltrace.conditions.view import EventView, PausedRun
+from rsltrace.checks.conditions.functions import CONSTANTS, FUNCTIONS, OF_MODULES
+from rsltrace.checks.conditions.names import RunNames, wrong_field
+from rsltrace.checks.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.trace.words.entities import nodes_called, short_name
 

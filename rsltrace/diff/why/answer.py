@@ -8,17 +8,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from statistics import median
 from typing import Any, NoReturn, Protocol
 
-from rsltrace.errors import TraceError, near_or_all, nearest
-from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.finding import decode_unseen, unseen_text
-from rsltrace.trace.model.operation import is_built_in
-from rsltrace.trace.model.texts import printable
-from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.entities import nodes_called
-from rsltrace.trace.words.events import EventWords
-from rsltrace.trace.words.phrases import as_sentence
-from rsltrace.why.delivery import (
+from rsltrace.diff.why.delivery import (
     ClockStands,
     Late,
     LostByLink,
@@ -29,8 +19,8 @@ from rsltrace.why.delivery import (
     Unfinished,
     Waiting,
 )
-from rsltrace.why.filters import NoTransform, UnmatchedStamps
-from rsltrace.why.graph import (
+from rsltrace.diff.why.filters import NoTransform, UnmatchedStamps
+from rsltrace.diff.why.graph import (
     CreatedLate,
     IncompatibleQos,
     NodeEnded,
@@ -38,8 +28,18 @@ from rsltrace.why.graph import (
     NotConstructed,
     NotReceived,
 )
-from rsltrace.why.history import RunHistory
-from rsltrace.why.question import SENDERS, WITH_CALLBACK, Question, Reason, filter_of
+from rsltrace.diff.why.history import RunHistory
+from rsltrace.diff.why.question import SENDERS, WITH_CALLBACK, Question, Reason, filter_of
+from rsltrace.errors import TraceError, near_or_all, nearest
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.finding import decode_unseen, unseen_text
+from rsltrace.trace.model.operation import is_built_in
+from rsltrace.trace.model.texts import printable
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.entities import nodes_called
+from rsltrace.trace.words.events import EventWords
+from rsltrace.trace.words.phrases import as_sentence
 
 # Finds the callback that is meant, or why there is none.
 

@@ -27,7 +27,7 @@ from types import (
 )
 from typing import Any, Protocol
 
-from rsltrace.conditions.bounds import (
+from rsltrace.checks.conditions.bounds import (
     DEPTH_MAX,
     STEPS_EACH,
     TEXT_MAX,
@@ -36,7 +36,7 @@ from rsltrace.conditions.bounds import (
     spend_for,
     within_limits,
 )
-from rsltrace.conditions.functions import (
+from rsltrace.checks.conditions.functions import (
     CONSTANTS,
     FUNCTIONS,
     METHODS,
@@ -44,7 +44,7 @@ from rsltrace.conditions.functions import (
     OF_MODULES,
     items,
 )
-from rsltrace.conditions.operators import BINARY, COMPARE, UNARY, USUAL, element
+from rsltrace.checks.conditions.operators import BINARY, COMPARE, UNARY, USUAL, element
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.trace.model.texts import PLACEHOLDERS
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from rsltrace.diff.why.question import SENDERS, Question, Reason, qos_of
 from rsltrace.errors import nearest
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind, RandomDecision, decision_kind, decision_text
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable, shortened
-from rsltrace.why.question import SENDERS, Question, Reason, qos_of
 
 _TEXT_MAX = 200
 _CRASHES = (RandomDecision.CRASH, RandomDecision.RESTART)

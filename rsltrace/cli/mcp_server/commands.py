@@ -12,7 +12,7 @@ import anyio
 from anyio.abc import Process
 
 from rsltrace.child_processes import how_ended, kill_group, rsltrace_command
-from rsltrace.mcp_server.answers import Page, PageKeeper
+from rsltrace.cli.mcp_server.answers import Page, PageKeeper
 
 GRACE_S = 1.2
 """From SIGTERM, at which a command closes its trace and ends its processes, to SIGKILL. Clients

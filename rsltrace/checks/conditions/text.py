@@ -24,10 +24,10 @@ import re
 from collections.abc import Callable
 from functools import partial
 
-from rsltrace.conditions.condition import ActiveCondition, EventCondition
-from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.names import RunNames, topic_of, with_topic_prefix
-from rsltrace.conditions.occurrences import (
+from rsltrace.checks.conditions.condition import ActiveCondition, EventCondition
+from rsltrace.checks.conditions.expressions import parse_expression
+from rsltrace.checks.conditions.names import RunNames, topic_of, with_topic_prefix
+from rsltrace.checks.conditions.occurrences import (
     EntityCondition,
     ExceptionCondition,
     FilteredCondition,
@@ -43,7 +43,7 @@ from rsltrace.conditions.occurrences import (
     says_pattern,
     says_words,
 )
-from rsltrace.conditions.view import PausedRun
+from rsltrace.checks.conditions.view import PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.model.finding import NondeterminismSource

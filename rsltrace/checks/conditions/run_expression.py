@@ -6,8 +6,8 @@ import ast
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rsltrace.conditions.bounds import StepBudget
-from rsltrace.conditions.evaluation import (
+from rsltrace.checks.conditions.bounds import StepBudget
+from rsltrace.checks.conditions.evaluation import (
     Evaluate,
     ExpressionContext,
     TextPositions,
@@ -16,7 +16,7 @@ from rsltrace.conditions.evaluation import (
     parsed,
     value_of,
 )
-from rsltrace.conditions.functions import FUNCTIONS
+from rsltrace.checks.conditions.functions import FUNCTIONS
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.trace.reader import Trace
 

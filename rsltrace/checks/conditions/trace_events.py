@@ -9,10 +9,10 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.conditions.names import names_of, topic_of, with_topic_prefix
-from rsltrace.conditions.occurrences import TimeCondition, WatchCondition, WhenCondition
-from rsltrace.conditions.text import parse_condition
-from rsltrace.conditions.view import SentOutput
+from rsltrace.checks.conditions.names import names_of, topic_of, with_topic_prefix
+from rsltrace.checks.conditions.occurrences import TimeCondition, WatchCondition, WhenCondition
+from rsltrace.checks.conditions.text import parse_condition
+from rsltrace.checks.conditions.view import SentOutput
 from rsltrace.errors import ConditionError, TraceError
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventRecord, Output, OutputKind
 from rsltrace.trace.model.finding import decode_unseen

@@ -7,7 +7,13 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rsltrace.conditions.bounds import INT_BITS_MAX, SIZE_MAX, LimitError, StepBudget, within_limits
+from rsltrace.checks.conditions.bounds import (
+    INT_BITS_MAX,
+    SIZE_MAX,
+    LimitError,
+    StepBudget,
+    within_limits,
+)
 
 Operate = Callable[[StepBudget, Any, Any], Any]
 _REALS = frozenset((int, float, bool))

@@ -10,9 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
+from rsltrace.cli.mcp_server.access import Access, RefusedError
 from rsltrace.debug.client import DebugSession
 from rsltrace.errors import RsltraceError
-from rsltrace.mcp_server.access import Access, RefusedError
 
 _SESSIONS_MAX = 2
 _PAUSE_S = 0.1

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
 
+from rsltrace.diff.why.history import Message
+from rsltrace.diff.why.question import Question, Reason
 from rsltrace.simulation.loop.timer_queue import ZERO_PERIOD_NS
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.entity import EntityKind
@@ -14,8 +16,6 @@ from rsltrace.trace.model.event import OutputKind, decision_text, encode_decisio
 from rsltrace.trace.model.finding import decode_drops, decode_waits
 from rsltrace.trace.model.operation import TIMER_CANCEL, pack_operation
 from rsltrace.trace.model.texts import format_duration, printable
-from rsltrace.why.history import Message
-from rsltrace.why.question import Question, Reason
 
 _AT_LINE = re.compile(r" at (\S+:\d+) in ")
 _HINT = ", which may be one of the events"

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from rsltrace.diff.why.question import Question, Reason, filter_of
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, format_duration, printable, shortened
 from rsltrace.trace.words.logs import log_record
 from rsltrace.trace.words.phrases import seconds_text
-from rsltrace.why.question import Question, Reason, filter_of
 
 _SHOWN = 3
 _SPOKEN = (OutputKind.LOG, OutputKind.EXCEPTION)

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
+from rsltrace.cli.mcp_server.access import Access, RefusedError
+from rsltrace.cli.mcp_server.answers import Page, PageKeeper, answer, page_of
+from rsltrace.cli.mcp_server.commands import CommandResult, run_command
+from rsltrace.cli.mcp_server.sessions import Sessions
 from rsltrace.debug.prompt.show import position_line, stopped_lines
-from rsltrace.mcp_server.access import Access, RefusedError
-from rsltrace.mcp_server.answers import Page, PageKeeper, answer, page_of
-from rsltrace.mcp_server.commands import CommandResult, run_command
-from rsltrace.mcp_server.sessions import Sessions
 
 if TYPE_CHECKING:
     from rsltrace.debug.checkpoints import RunPosition
@@ -388,7 +388,7 @@ class Tools:
         folders = json.dumps([str(one) for one in self._access.folders])
         path = str(self._access.existing(trace))
         words = [form, path, str(event), folders, json.dumps(list(sections))]
-        done = await self._run(words, module="rsltrace.mcp_server.event_page", skip=skip)
+        done = await self._run(words, module="rsltrace.cli.mcp_server.event_page", skip=skip)
         return self._answer(f"{form}: event {event} of {trace}", done, then)
 
     async def _read(self, title: str, words: Sequence[str], then: Sequence[str], skip: int) -> str:

@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from types import GeneratorType
 from typing import Any
 
-from rsltrace.conditions.bounds import INT_BITS_MAX, LimitError, StepBudget, within_limits
-from rsltrace.conditions.operators import BINARY, fits, is_array, numeric, plain
+from rsltrace.checks.conditions.bounds import INT_BITS_MAX, LimitError, StepBudget, within_limits
+from rsltrace.checks.conditions.operators import BINARY, fits, is_array, numeric, plain
 
 Function = Callable[..., Any]
 

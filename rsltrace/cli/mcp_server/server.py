@@ -21,13 +21,13 @@ from mcp.server.mcpserver.exceptions import ToolError
 from mcp.types import ToolAnnotations
 
 from rsltrace._version import __version__
+from rsltrace.cli.mcp_server.access import Access, RefusedError
+from rsltrace.cli.mcp_server.answers import answer as answer_of
+from rsltrace.cli.mcp_server.answers import bounded, page_of
+from rsltrace.cli.mcp_server.sessions import Sessions
+from rsltrace.cli.mcp_server.tools import READING, TOOLS, Tools
 from rsltrace.errors import RsltraceError
 from rsltrace.job.documents.schema import job_schema
-from rsltrace.mcp_server.access import Access, RefusedError
-from rsltrace.mcp_server.answers import answer as answer_of
-from rsltrace.mcp_server.answers import bounded, page_of
-from rsltrace.mcp_server.sessions import Sessions
-from rsltrace.mcp_server.tools import READING, TOOLS, Tools
 
 _END_S = 1.7
 """From SIGTERM to the end: commands end in ``commands.GRACE_S``, and clients wait two seconds."""

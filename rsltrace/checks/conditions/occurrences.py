@@ -8,9 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from rsltrace.conditions.condition import ActiveCondition, error_text, is_true, shown, shown_text
-from rsltrace.conditions.expressions import Expression
-from rsltrace.conditions.view import EventView, PausedRun, SentOutput
+from rsltrace.checks.conditions.condition import (
+    ActiveCondition,
+    error_text,
+    is_true,
+    shown,
+    shown_text,
+)
+from rsltrace.checks.conditions.expressions import Expression
+from rsltrace.checks.conditions.view import EventView, PausedRun, SentOutput
 from rsltrace.job.values.times import TimeInRun
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds

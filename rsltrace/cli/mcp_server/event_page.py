@@ -1,6 +1,6 @@
 """One event of a trace as text, or the walk back through its causes. Runs in its own process.
 
-python -m rsltrace.mcp_server.event_page event|why TRACE INDEX FOLDERS SECTIONS
+python -m rsltrace.cli.mcp_server.event_page event|why TRACE INDEX FOLDERS SECTIONS
 """
 
 from __future__ import annotations

@@ -12,13 +12,13 @@ from itertools import pairwise
 from statistics import median
 from typing import Any, ClassVar
 
+from rsltrace.diff.why.history import Message, Occupation, RunHistory
 from rsltrace.simulation.middleware.qos.policies import Qos, incompatible_policies
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, OutputKind
 from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.words.code import entity_places
 from rsltrace.trace.words.phrases import exception_of, seconds_text
-from rsltrace.why.history import Message, Occupation, RunHistory
 
 SENDERS = {
     EntityKind.SUBSCRIPTION: EntityKind.PUBLISHER,

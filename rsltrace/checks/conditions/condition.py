@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from rsltrace.conditions.bounds import LimitError
-from rsltrace.conditions.expressions import Expression
-from rsltrace.conditions.view import EventView, PausedRun
+from rsltrace.checks.conditions.bounds import LimitError
+from rsltrace.checks.conditions.expressions import Expression
+from rsltrace.checks.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, RsltraceError
 
 _COMES_AND_GOES = (IndexError, KeyError, ZeroDivisionError)
