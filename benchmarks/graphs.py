@@ -103,17 +103,17 @@ EVENTS_PER_CALL = 3
 
 
 def _action_nodes() -> list[Any]:
-    import whole
+    import usual_nodes
 
-    return [whole.Asker(), whole.Worker()]
+    return [usual_nodes.Asker(), usual_nodes.Worker()]
 
 
 def _action_job(callbacks: int) -> dict[str, Any]:
     goals = max(1, callbacks // EVENTS_PER_GOAL)
     return {
         "nodes": [
-            {"node": "whole:Asker", "parameters": {"goals": goals}},
-            {"node": "whole:Worker"},
+            {"node": "usual_nodes:Asker", "parameters": {"goals": goals}},
+            {"node": "usual_nodes:Worker"},
         ],
         "search_path": [str(BENCHMARKS)],
         "livelock_limit": 10 * (callbacks + 100),
@@ -124,7 +124,7 @@ def _action_job(callbacks: int) -> dict[str, Any]:
 def _mains_job(callbacks: int) -> dict[str, Any]:
     job = _ping_pong_job(callbacks)
     ping, pong = job["nodes"]
-    ping["main"], pong["main"] = "whole:ping", "whole:pong"
+    ping["main"], pong["main"] = "usual_nodes:ping", "usual_nodes:pong"
     del ping["node"], pong["node"]
     job["search_path"].append(str(BENCHMARKS))
     return job
@@ -133,7 +133,10 @@ def _mains_job(callbacks: int) -> dict[str, Any]:
 def _calls_job(callbacks: int) -> dict[str, Any]:
     calls = max(1, callbacks // EVENTS_PER_CALL)
     return {
-        "nodes": [{"main": "whole:call", "parameters": {"calls": calls}}, {"main": "whole:serve"}],
+        "nodes": [
+            {"main": "usual_nodes:call", "parameters": {"calls": calls}},
+            {"main": "usual_nodes:serve"},
+        ],
         "search_path": [str(BENCHMARKS)],
         "livelock_limit": 10 * (callbacks + 100),
         "stop": {"topic": {"name": "/caller/done", "exit_code": "data"}},

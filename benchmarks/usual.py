@@ -392,7 +392,8 @@ def all_cases() -> list[Case]:
             "mains",
             "ping-pong of mains that spin",
             callback,
-            as_processes(["whole:ping", *BURST], ["whole:pong"]) | both(GRAPHS["mains"], events),
+            as_processes(["usual_nodes:ping", *BURST], ["usual_nodes:pong"])
+            | both(GRAPHS["mains"], events),
             1.5,
             "nodes",
         ),
@@ -407,14 +408,14 @@ def all_cases() -> list[Case]:
             "calls",
             "blocking calls of a main",
             f"call, {EVENTS_PER_CALL} events",
-            as_processes(["usual_nodes:call"], ["whole:serve"])
+            as_processes(["usual_nodes:call"], ["usual_nodes:serve"])
             | both(here["calls"], 10_000, units=10_000),
         ),
         Case(
             "until",
             "same, by spin_until_future_complete",
             "call",
-            as_processes(["usual_nodes:call_and_spin"], ["whole:serve"])
+            as_processes(["usual_nodes:call_and_spin"], ["usual_nodes:serve"])
             | both(here["until"], 10_000, units=10_000),
         ),
         Case(

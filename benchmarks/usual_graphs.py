@@ -58,7 +58,7 @@ def usual_graphs() -> dict[str, Graph]:
     ]
     goals = [
         {"node": "usual_nodes:GoalAsker", "parameters": {"goals": lambda count: count}},
-        {"node": "whole:Worker"},
+        {"node": "usual_nodes:Worker"},
     ]
     asked = {"topic": {"name": "/asker/done", "exit_code": "data"}}
     logs = job_of([{"node": "usual_nodes:Logger", **period}], for_ms(make.EACH))
@@ -67,8 +67,8 @@ def usual_graphs() -> dict[str, Graph]:
     once = mains("ping_once", "usual_nodes:pong_once", done=PING_DONE)
     graphs = (
         Graph("once", "", (), None, once),
-        Graph("calls", "", (), None, mains("call", "whole:serve", done=CALL_DONE)),
-        Graph("until", "", (), None, mains("call_and_spin", "whole:serve", done=CALL_DONE)),
+        Graph("calls", "", (), None, mains("call", "usual_nodes:serve", done=CALL_DONE)),
+        Graph("until", "", (), None, mains("call_and_spin", "usual_nodes:serve", done=CALL_DONE)),
         Graph("logs", "", (), make.log_nodes, logs),
         Graph("sets", "", (), make.set_nodes, sets),
         Graph("goals", "", (), make.goal_nodes, job_of(goals, asked)),

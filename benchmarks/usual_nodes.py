@@ -1,4 +1,5 @@
-"""Nodes and mains for ``usual.py``: what users bring, and as little of their own work as can be.
+"""Nodes and mains for ``graphs.py`` and ``usual.py``: what users bring, and as little of their own
+work as can be.
 
 ``callbacks`` of a node counts what a figure is divided by: logs, goals, sets, images, calls.
 """
@@ -8,21 +9,85 @@ from __future__ import annotations
 import array
 import os
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import rclpy
+from rclpy.action import ActionClient, ActionServer
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import UInt8
 from std_srvs.srv import Trigger
-from whole import Asker, Worker
+
+FEEDBACKS = 3
 
 EACH = 100
 """Logs and sets of a parameter in one callback."""
 
 IMAGE_WIDTH, IMAGE_HEIGHT = 2000, 1000
 IMAGE_BYTES = 3 * IMAGE_WIDTH * IMAGE_HEIGHT
+
+
+class Worker(Node):
+    """An action server: every goal gets a few feedbacks and a result, which is soon forgotten."""
+
+    def __init__(self) -> None:
+        from test_msgs.action import Fibonacci
+
+        super().__init__("worker")
+        self.callbacks = 0
+        self._feedback = Fibonacci.Feedback(sequence=[0, 1])
+        self._result = Fibonacci.Result(sequence=[0, 1])
+        self._server = ActionServer(self, Fibonacci, "work", self._work, result_timeout=0.02)
+
+    def _work(self, goal: Any) -> Any:
+        self.callbacks += 1
+        for _ in range(FEEDBACKS):
+            goal.publish_feedback(self._feedback)
+        goal.succeed()
+        return self._result
+
+
+class Asker(Node):
+    """An action client: a goal with every tick of a timer, unless the last one is not done.
+
+    Parameters: ``goals``, how many, then 0 is published on /asker/done (0: it never ends);
+    ``period``, seconds.
+    """
+
+    def __init__(self) -> None:
+        from test_msgs.action import Fibonacci
+
+        super().__init__("asker")
+        self.callbacks = 0
+        self._goal = Fibonacci.Goal(order=1)
+        self._left = self.declare_parameter("goals", 0).value or -1
+        self._idle = True
+        self._client = ActionClient(self, Fibonacci, "work")
+        self._done = self.create_publisher(UInt8, "/asker/done", 10)
+        self.create_timer(self.declare_parameter("period", 0.001).value, self._ask)
+
+    def _ask(self) -> None:
+        self.callbacks += 1
+        if self._idle and self._client.server_is_ready():
+            self._idle = False
+            future = self._client.send_goal_async(self._goal, self._heard)
+            future.add_done_callback(self._accepted)
+
+    def _heard(self, message: Any) -> None:
+        self.callbacks += 1
+
+    def _accepted(self, future: Any) -> None:
+        self.callbacks += 1
+        future.result().get_result_async().add_done_callback(self._finished)
+
+    def _finished(self, future: Any) -> None:
+        self.callbacks += 1
+        self._idle = True
+        self._left -= 1
+        if not self._left:
+            self._done.publish(UInt8(data=0))
 
 
 class Logger(Node):
@@ -155,29 +220,54 @@ def image_nodes() -> list[Any]:
     return [Camera(), Display("left"), Display("right")]
 
 
+def ping() -> None:
+    """An executable that spins the pinging node of the ping-pong game."""
+    _spin("Ping", rclpy.spin)
+
+
+def pong() -> None:
+    """An executable that spins the answering node."""
+    _spin("Pong", rclpy.spin)
+
+
 def ping_once() -> None:
     """An executable that spins the pinging node by ``spin_once``."""
-    _spin_once("Ping")
+    _spin("Ping", _spin_once)
 
 
 def pong_once() -> None:
     """An executable that spins the answering node by ``spin_once``."""
-    _spin_once("Pong")
+    _spin("Pong", _spin_once)
 
 
-def _spin_once(name: str) -> None:
+def _spin_once(node: Node) -> None:
+    while rclpy.ok():
+        rclpy.spin_once(node)
+
+
+def _spin(name: str, spin: Callable[[Node], None]) -> None:
     import ping_pong
 
     rclpy.init()
     node = getattr(ping_pong, name)()
     try:
-        while rclpy.ok():
-            rclpy.spin_once(node)
+        spin(node)
     except KeyboardInterrupt:
         pass
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+
+
+def serve() -> None:
+    """An executable that answers calls."""
+    rclpy.init()
+    node = Node("server")
+    node.create_service(Trigger, "call", lambda request, response: response)
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        pass
 
 
 def call() -> None:

@@ -55,6 +55,7 @@ _IN_MODULE_OF = {
     "rerun": "export",
     "schema": "init",
     "completion": "options",
+    "mcp": "mcp_server.access",
 }
 
 

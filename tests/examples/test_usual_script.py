@@ -18,7 +18,7 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 def usual(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     pytest.importorskip("rclpy")
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    for name in ("bare", "graphs", "throughput", "usual", "usual_graphs", "usual_nodes", "whole"):
+    for name in ("bare", "graphs", "throughput", "usual", "usual_graphs", "usual_nodes"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module("usual")
 

@@ -232,8 +232,7 @@ def slept_text(slept: SleepTimes) -> str:
 def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     early, late = sorted((a.stamp_ns, b.stamp_ns))
-    times = f"{at_time(early)} and {at_time(late)}"
-    return f"the bag's messages on {a.entity.name} {times} are swapped"
+    return f"the bag's messages on {a.entity.name} {at_time(early)} and {at_time(late)} are swapped"
 
 
 @says(DivergenceKind.BAG_MESSAGE_MOVED)
