@@ -23,8 +23,6 @@ from mcap.opcode import Opcode
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
-EVENT_BYTES = 70
-OUTPUT_BYTES = 28
 SEGMENT_ROW = struct.Struct("<11Q")
 CDR = b"\x00\x01\x00\x00"
 MESSAGE_HEAD = struct.Struct("<HIQQ")

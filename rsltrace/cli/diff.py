@@ -11,7 +11,7 @@ import click
 
 from rsltrace.cli.options import complete_files
 from rsltrace.cli.output.text_file import write_text
-from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
+from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions, exit_code_of_several
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceError, TraceFormatError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.regular_file import check_not_input
@@ -231,8 +231,6 @@ def _diff(
             errors[f"{other} agrees with {golden}"] = str(error)
     if done or form in _CI_FORMATS:
         print_diffs(done, form, options, output, errors)
-    from rsltrace.diff.options import exit_code_of_several
-
     return EXIT_USAGE if errors else exit_code_of_several(one.exit_code for one in done)
 
 

@@ -20,7 +20,7 @@ from rsltrace.cli.verify import handling_signals
 from rsltrace.errors import ExploreError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.regular_file import replacement_of
-from rsltrace.trace.model.texts import printable
+from rsltrace.trace.model.texts import NS_PER_S, printable
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
@@ -39,7 +39,6 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Searc
     """Read ``1000`` (trials) or ``10min`` (of real time)."""
     from rsltrace.job.values.times import parse_time
     from rsltrace.search.explore.search import SearchBudget
-    from rsltrace.trace.model.texts import NS_PER_S
 
     if re.fullmatch(r"\d+", text.strip()):
         if int(text) == 0:

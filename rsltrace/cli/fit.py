@@ -26,9 +26,13 @@ from rsltrace.native.fit.comparison import (
     ChainCheck,
     LatencyCheck,
     SampleComparison,
+    chains_of,
+    check_latencies,
     mismatched_percentiles,
+    need_scipy,
 )
-from rsltrace.native.fit.fitted_job import Fit, time_text
+from rsltrace.native.fit.fitted_job import Fit, fitted_job, notes, picture_of, time_text, with_files
+from rsltrace.native.fit.fitted_job import fit as fitted_to
 from rsltrace.native.fit.models import DurationModel, as_job_has_it
 from rsltrace.terminal import say, tell, tell_notes
 from rsltrace.trace.model.texts import format_duration, printable
@@ -38,7 +42,6 @@ from rsltrace.trace.words.phrases import table
 if TYPE_CHECKING:
     from rsltrace.job import Job
     from rsltrace.native.fit.comparison import Chains
-    from rsltrace.native.fit.fitted_job import Fit
 
 
 @click.command()
@@ -106,9 +109,6 @@ def fit(
     quantiles, their ratio with a 95 % confidence interval, and a two-sample test. The same
     comparison of the two native runs shows how much the robot itself varies.
     """
-    from rsltrace.native.fit.comparison import check_latencies
-    from rsltrace.native.fit.fitted_job import fit as fitted_to
-    from rsltrace.native.fit.fitted_job import notes
     from rsltrace.native.fit.measurement import measure_times
 
     if simulated is not None and second is None:
@@ -131,8 +131,6 @@ def fit(
         if output is not None:
             _write(output, found, job, path, first, settings)
         if plot is not None:
-            from rsltrace.native.fit.fitted_job import picture_of
-
             save_picture(picture_of(found, first.name), plot)
         checked = None
         if wanted is not None:
@@ -207,8 +205,6 @@ def _write(
     settings: Mapping[str, Any],
 ) -> None:
     """Write the fitted job, and check that it loads."""
-    from rsltrace.native.fit.fitted_job import fitted_job, with_files
-
     if output.exists() and job_file.exists() and output.samefile(job_file):
         raise OutputError(f"{output} is the job that the fitted one extends: name another file")
     base = os.path.relpath(job_file.absolute(), output.absolute().parent).replace(os.sep, "/")
@@ -264,8 +260,6 @@ def _chains(second: Trace) -> Chains:
     :raises SetupError: if what compares them is missing.
     :raises TraceError: if there are none.
     """
-    from rsltrace.native.fit.comparison import chains_of, need_scipy
-
     need_scipy()
     return chains_of(second)
 

@@ -186,8 +186,7 @@ def _opened(
         stack.callback(session.close)
         return session, partial(ViewerApp, session)
     from rsltrace_viewer.live.app import LiveApp
-    from rsltrace_viewer.live.execution import Execution
-    from rsltrace_viewer.live.state import LiveSession
+    from rsltrace_viewer.live.execution import Execution, LiveSession
     from rsltrace_viewer.model.run import Run
 
     from rsltrace.cli.output.search_progress import working

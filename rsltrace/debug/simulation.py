@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import ReplayError, RsltraceError
-from rsltrace.forking import die_with_parent, end_process
+from rsltrace.forking import die_with_parent, end_process, other_threads
 from rsltrace.guard.pin import pin, unpin
 from rsltrace.line_protocol import Lines
 
@@ -125,7 +125,6 @@ def _serve(
 def _middleware_threads() -> frozenset[int]:
     """Return the threads that DDS starts when it is loaded; a simulation does not use them."""
     from rsltrace.adapters.rclpy.boundary.installation import check_no_simulation
-    from rsltrace.forking import other_threads
 
     check_no_simulation()
     with suppress(ImportError):  # the session says what is missing

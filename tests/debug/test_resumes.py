@@ -8,8 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
-from rsltrace_viewer.live.execution import Executed
-from rsltrace_viewer.live.state import LiveSession
+from rsltrace_viewer.live.execution import Executed, LiveSession
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import node_of
 

@@ -32,7 +32,6 @@ from rsltrace.trace.writer import TraceWriter
 
 # /source ticks every 10 ms; /left and /right hear it, /sum hears both, /odd has nothing to do with
 # any of it. All remember everything they heard.
-SUM = (Publication("/s"),)
 PLAN = Plan(
     (
         NodePlan("/source", timers=((10 * MS, (Publication("/a"),)),)),

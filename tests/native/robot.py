@@ -191,14 +191,6 @@ class Stuck(Node):
         threading.Event().wait()
 
 
-class Quits(Node):
-    """Shuts rclpy down."""
-
-    def __init__(self) -> None:
-        super().__init__("quits")
-        self.create_timer(0.05, rclpy.shutdown)
-
-
 class Nested(Node):
     """Spins another node within a callback."""
 

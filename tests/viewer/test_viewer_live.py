@@ -20,8 +20,7 @@ from click.testing import CliRunner
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace_viewer.live.app import BreakpointsPanel, LiveApp
-from rsltrace_viewer.live.execution import Execution
-from rsltrace_viewer.live.state import LiveSession
+from rsltrace_viewer.live.execution import Execution, LiveSession
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import node_of
 from rsltrace_viewer.terminal.keys import KEYS, LIVE_KEYS

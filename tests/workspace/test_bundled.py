@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from rsltrace.adapters.workspace import cache
+from rsltrace.adapters.workspace.bundled import BUNDLED, bundled_packages
 from rsltrace.adapters.workspace.imports import unbuilt_packages
-from rsltrace.adapters.workspace.interfaces import BUNDLED, bundled_packages
 from rsltrace.errors import SetupError
 from rsltrace.job import load_job
 from rsltrace.run import run

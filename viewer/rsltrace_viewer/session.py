@@ -48,9 +48,8 @@ if TYPE_CHECKING:
     from rsltrace.diff.alignment.aligned_rows import AlignedRow
     from rsltrace.diff.traces.aligned_runs import Block
     from rsltrace_viewer.model.callback_question import CallbackQuestion
-    from rsltrace_viewer.model.comparison import Comparison
+    from rsltrace_viewer.model.comparison import Comparison, PairValues
     from rsltrace_viewer.model.plots.runs import RunPlots
-    from rsltrace_viewer.model.timeline.pair_values import PairValues
 
 SEEK: dict[str, tuple[EventFilter, str]] = {
     "raised": (conditions.RAISED, "exception"),
@@ -80,8 +79,7 @@ class Session:
         if b is not None:
             for run in (a, b):
                 refuse_native(run.trace, "its events are at times of their own (see rsltrace diff)")
-            from rsltrace_viewer.model.comparison import Comparison
-            from rsltrace_viewer.model.timeline.pair_values import PairValues
+            from rsltrace_viewer.model.comparison import Comparison, PairValues
 
             self.view = self.comparison = Comparison(a, b)
             self._pair_values = PairValues(self.comparison.runs)

@@ -191,9 +191,6 @@ def _sql(rng: Random, case: Case, corpus: Corpus) -> None:
     _ask(rng, case)
 
 
-_NUMBER_KEYS = ("version", "message_count", "nanoseconds", "nanoseconds_since_epoch")
-
-
 def _metadata(rng: Random, case: Case, corpus: Corpus) -> None:
     folder = _copied(case, rng.choice((corpus.bag, corpus.sqlite_bag)))
     place = folder / "metadata.yaml"

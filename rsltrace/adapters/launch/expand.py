@@ -83,7 +83,6 @@ def main(order: Mapping[str, object]) -> None:
     """Do what an order asks, and write the answer: a ``LaunchResult``, or the text of an error."""
     from rsltrace.adapters.launch.api.basics import as_job_error, shown
     from rsltrace.adapters.launch.python_file import read_launch_file
-    from rsltrace.adapters.workspace.imports import unbuilt_packages
 
     sys.path[:] = order["path"]  # type: ignore[call-overload]
     folders = [Path(folder) for folder in order["folders"]]  # type: ignore[attr-defined]

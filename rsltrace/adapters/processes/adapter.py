@@ -25,7 +25,6 @@ from rsltrace.trace.model.finding import NondeterminismSource
 
 _LOOKS_AHEAD = 64
 """How much of the ready queue is looked at for others that may begin."""
-_EVERY_PROCESS_ENDED = "every process has ended"
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.adapters.workspace.interfaces import BUNDLED, bundled_packages
+from rsltrace.adapters.workspace.bundled import BUNDLED, bundled_packages
 from rsltrace.errors import SetupError
 from rsltrace.guard.guard import engage
 from rsltrace.trace.model.module_search import is_beside_package_xml

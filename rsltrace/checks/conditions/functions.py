@@ -353,9 +353,7 @@ OF_MODULES: dict[str, dict[str, Function]] = {
         "prod": _prod,
     },
     "np": {
-        **{
-            name: _of_numpy(name, takes) for name, takes in {**_OF_ARRAYS, **_ONLY_OF_NUMPY}.items()
-        },
+        **{name: _of_numpy(name, takes) for name, takes in _OF_NUMPY.items()},
         **{
             numpy_name: _of_numpy(numpy_name, 2 if name in _OF_TWO else 1)
             for name in _OF_NUMBERS

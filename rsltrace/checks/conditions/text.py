@@ -52,7 +52,6 @@ from rsltrace.trace.words.entities import LOG_LEVELS, is_named
 _HEAD = re.compile(r"([A-Za-z_]+)(?:\s*[:=]\s*|\s+|\Z)")
 _MESSAGE = re.compile(r"([/A-Za-z_*?~][^\s:]*)\s*:(?!:)\s*")
 _IF = re.compile(r"\bif\b")
-_CLOSING = re.compile(r"/(?=\s*\Z|\s+if\b)")
 _TYPE = re.compile(r"[A-Za-z_][\w.]*")
 _HASH = re.compile(r"([0-9a-fA-F]{1,16})(?:…|\.\.\.)?")
 _WORDS = {

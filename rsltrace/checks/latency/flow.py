@@ -98,7 +98,6 @@ _SUSPENDED = int(EventFlag.SUSPENDED)
 _KIND_BITS = encode_decision(1).bit_length() - 1
 _VALUE = encode_decision(1) - 1
 _LOST = (int(RandomDecision.DROP), int(RandomDecision.BURST), int(RandomDecision.OUTAGE))
-_Columns = tuple[list[int], ...]
 _Selected = tuple[int, int, int, int]
 """An output: which of its event's, its kind, entity and hash."""
 

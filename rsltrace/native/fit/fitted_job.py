@@ -18,7 +18,7 @@ from rsltrace.native.fit.models import FEW, DurationModel, as_job_has_it, model_
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
 _UNITS = ((1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"))
-TABLES, DISTRIBUTIONS, SERIES = HOW = ("tables", "distributions", "series")
+TABLES, DISTRIBUTIONS, SERIES = ("tables", "distributions", "series")
 OWN_POLICY = "priority"
 """What native executors go by whose priorities are those of the job's own policy."""
 _TAIL_NS = 500_000

@@ -110,7 +110,6 @@ class NativeTimes:
 
 
 Rows = npt.NDArray[np.void]
-Flags = npt.NDArray[np.bool_]
 
 STEP_NS = 10_000_000
 """A system clock that moves by more than this against the steady one was set."""

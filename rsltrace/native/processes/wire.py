@@ -130,9 +130,6 @@ class Link:
         self._socket.close()
 
 
-_LOG = "rcl_interfaces/msg/Log"
-
-
 class SpanEncoder:
     """Makes plain values of spans, in the process that was observed."""
 

@@ -16,8 +16,14 @@ from rsltrace.debug.checkpoints import Breakpoint
 from rsltrace.debug.client import DebugSession
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.trace.model.texts import printable
-from rsltrace_viewer.live.execution import WATCHES_MAX, Executed, Execution, LiveStop, Superseded
-from rsltrace_viewer.live.state import LiveSession
+from rsltrace_viewer.live.execution import (
+    WATCHES_MAX,
+    Executed,
+    Execution,
+    LiveSession,
+    LiveStop,
+    Superseded,
+)
 from rsltrace_viewer.terminal.app import ViewerApp
 from rsltrace_viewer.terminal.keys import LIVE_KEYS
 from rsltrace_viewer.terminal.screens.text import PickScreen

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from functools import lru_cache
 from types import CodeType, FunctionType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rsltrace.guard.guard import engage
 from rsltrace.guard.state.hashing import UNCHANGING, StateHasher
@@ -16,9 +16,6 @@ from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.finding import GuardPolicy
-
-if TYPE_CHECKING:
-    from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 
 
 class NodeState:

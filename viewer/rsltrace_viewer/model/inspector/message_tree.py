@@ -63,8 +63,6 @@ class Openness:
 
 _PREVIEW = 120
 _ITEMS_PER_LEVEL = 100
-_OPEN_BY_ITSELF = 1
-"""Fields of a message are shown; what is inside of them has to be opened, unless it is small."""
 _SMALL = 8
 
 
