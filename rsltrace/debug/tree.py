@@ -8,15 +8,8 @@ import time
 from collections import deque
 from typing import Any
 
-from rsltrace.debug.checkpoints import (
-    COUNT_MAX,
-    Checkpoint,
-    Checkpoints,
-    Family,
-    Lost,
-    SimProcess,
-    memory_bytes,
-)
+from rsltrace.debug.checkpoints import COUNT_MAX, Checkpoint, Checkpoints
+from rsltrace.debug.processes import Family, Lost, SimProcess, memory_bytes
 from rsltrace.errors import DebugError
 from rsltrace.line_protocol import Lines, Message
 
