@@ -55,7 +55,6 @@ _IN_MODULE_OF = {
     "rerun": "export",
     "schema": "init",
     "completion": "options",
-    "mcp": "mcp_server.access",
 }
 
 

@@ -16,7 +16,7 @@ from rsltrace.errors import JobError, ReplayError, TraceError
 from rsltrace.job import Job, StopSpec, job_from_text, load_job
 from rsltrace.job.fields import COMMAND_LINE
 from rsltrace.job.parts.scheduling import PolicySpec
-from rsltrace.job.reading.resolved import job_from_resolved
+from rsltrace.job.reading.load import job_from_resolved
 from rsltrace.job.reading.substitute import installed_prefixes
 from rsltrace.replay.code import JobCodeFile, job_code_files, module_file
 from rsltrace.replay.edits import Edit, parse_edit
