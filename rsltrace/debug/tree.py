@@ -54,6 +54,8 @@ class CheckpointTree:
         self._is_quiet = False
         self._paused_s: float | None = None
         """When the client asked to stop what runs, in seconds of real time."""
+        self._recovers = False
+        """Whether it goes back to where it was, which is not to be stopped: it would be nowhere."""
         self._why_no_checkpoints = ""
         self._output, self._output_end = os.pipe()
         os.set_blocking(self._output, False)
@@ -132,6 +134,7 @@ class CheckpointTree:
         self.family.kill(self._cursor)
         index = int(before["index"])
         where = f"somewhere after event {index - 1}" if index else "at the start"
+        self._recovers, self._paused_s = True, None
         for is_last in (False, True):  # who kills one process may just have killed another
             try:
                 self._cursor, answer = self._at({"until": index})
@@ -143,6 +146,7 @@ class CheckpointTree:
                     raise SessionOverError(why) from None
             else:
                 break
+        self._recovers = False
         self.position = answer["position"]
         return Lost(f"the simulation was lost {where}: {error}; the session is back at {index}")
 
@@ -418,8 +422,9 @@ class CheckpointTree:
         self._client.read()
         while (request := self._client.next()) is not None:
             if process is not None and request.get("do") == "pause":
-                process.lines.send({"id": 0, "do": "pause"})
-                if self._paused_s is None:  # a second Ctrl-C does not wait longer
+                # Once: a second Ctrl-C does not wait longer, and many would fill the socket.
+                if self._paused_s is None and not self._recovers:
+                    process.lines.send({"id": 0, "do": "pause"})
                     self._paused_s = time.monotonic()
             else:
                 self._waiting.append(request)

@@ -241,15 +241,29 @@ def test_checkpoints_keep_within_their_bounds(job: Callable[..., Path], tmp_path
         assert found[0] == 0
 
 
+BEGUN = "Path(__file__).with_name('begun').touch()\n        "
+
+
+def paused_when_begun(session: DebugSession, folder: Path) -> threading.Thread:
+    """Pause a session when its node has done ``BEGUN``."""
+
+    def pause() -> None:
+        assert eventually((folder / "begun").exists)
+        session.pause()
+
+    thread = threading.Thread(target=pause)
+    thread.start()
+    return thread
+
+
 @pytest.mark.long
-def test_a_callback_that_does_not_come_back(job: Callable[..., Path]) -> None:
-    with DebugSession(job("while True: pass")) as session:
+def test_a_callback_that_does_not_come_back(job: Callable[..., Path], tmp_path: Path) -> None:
+    with DebugSession(job(f"{BEGUN}while True: pass")) as session:
         session.run_to(20)
-        timer = threading.Timer(1.0, session.pause)
-        timer.start()
+        pausing = paused_when_begun(session, tmp_path)
         with pytest.raises(DebugError, match=r"did not come back.* back at 20"):
             session.go_on()
-        timer.join()
+        pausing.join()
         assert session.step().position.index == 21
 
 
@@ -264,7 +278,7 @@ def test_an_endless_expression_ends_where_no_copy_can_be_made(
         stop = threading.Event()
 
         def keep_pressing() -> None:
-            while presses and not stop.wait(1.0):
+            while presses and not stop.wait(0.001):
                 session.pause()
 
         thread = threading.Thread(target=keep_pressing)
@@ -277,12 +291,11 @@ def test_an_endless_expression_ends_where_no_copy_can_be_made(
 
 
 @pytest.mark.long
-def test_a_run_is_paused_and_goes_on(job: Callable[..., Path]) -> None:
-    with DebugSession(job("pass", duration="3600s")) as session:
-        timer = threading.Timer(1.0, session.pause)
-        timer.start()
+def test_a_run_is_paused_and_goes_on(job: Callable[..., Path], tmp_path: Path) -> None:
+    with DebugSession(job(f"{BEGUN}pass", duration="1000000s")) as session:
+        pausing = paused_when_begun(session, tmp_path)
         stopped = session.go_on()
-        timer.join()
+        pausing.join()
         assert stopped.reason == "paused"
         index = stopped.position.index
         assert session.step().position.index == index + 1
