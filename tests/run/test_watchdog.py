@@ -310,8 +310,11 @@ def test_it_is_gone_after_the_run(tmp_path: Path) -> None:
 def test_signals_end_a_busy_loop_with_a_whole_trace(
     tmp_path: Path, number: signal.Signals, at_once: int, later: int
 ) -> None:
+    patience = "10**9" if later else "watchdog._LOOKS_BEFORE_END"  # or the second comes too late
     (tmp_path / "busy_node.py").write_text(
         "from rclpy.node import Node\n"
+        "from rsltrace.run import watchdog\n"
+        f"watchdog._LOOKS_BEFORE_END = {patience}\n"
         "class Busy(Node):\n"
         "    def __init__(self):\n"
         "        super().__init__('busy')\n"
