@@ -412,6 +412,23 @@ def _command(pid: int) -> str:
         return ""
 
 
+STALLS = """
+import itertools, os
+from rsltrace.debug import processes
+
+family = processes.Family()
+pid = os.posix_spawn("/bin/sh", ["sh", "-c", "kill -9 $$"], {})
+os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+processes.time.monotonic = itertools.count(0, 60).__next__
+print(family.how_ended(processes.SimProcess(None, pid)))
+"""
+
+
+def test_a_machine_that_stands_still_does_not_hide_how_a_process_ended() -> None:
+    done = subprocess.run([sys.executable, "-c", STALLS], capture_output=True, text=True)
+    assert done.stdout == "its process was killed by SIGKILL\n", done.stderr
+
+
 @pytest.mark.long
 def test_requests_that_are_none_are_answered(folder: Path) -> None:
     with DebugSession(folder / "run.mcap", trust=True) as session:
