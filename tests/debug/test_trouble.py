@@ -399,9 +399,11 @@ def test_a_client_that_is_killed(job: Callable[..., Path]) -> None:
         pids[:] = marked()
         return len(pids) > 4 and any(_command(pid) == "sleep" for pid in pids)
 
-    assert eventually(has_begun)
-    client.kill()
-    client.wait()
+    try:
+        assert eventually(has_begun)
+    finally:
+        client.kill()
+        client.wait()
     assert gone(pids)
 
 

@@ -184,7 +184,7 @@ def native(code: Path, name: str, slower: int) -> list[str]:
     if name == "lines":
         typed += ["\x04"] * 5
     until = time.monotonic() + 600
-    while not said and time.monotonic() < until:
+    while not said and time.monotonic() < until and process.poll() is None:
         time.sleep(0.05)
     time.sleep(1.0 * slower)
     for keys in typed:
