@@ -10,15 +10,22 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
 from rsltrace import DebugSession
+from rsltrace.debug import tree
 from rsltrace.debug.client import EditBranches
+from rsltrace.debug.processes import Lost, SimProcess
 from rsltrace.errors import DebugError, OutputError, RsltraceError
+from rsltrace.line_protocol import Lines
 
 pytestmark = pytest.mark.ros
 
@@ -429,6 +436,29 @@ print(family.how_ended(processes.SimProcess(None, pid)))
 def test_a_machine_that_stands_still_does_not_hide_how_a_process_ended() -> None:
     done = subprocess.run([sys.executable, "-c", STALLS], capture_output=True, text=True)
     assert done.stdout == "its process was killed by SIGKILL\n", done.stderr
+
+
+def test_a_machine_that_stands_still_does_not_end_a_callback(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tree, "Family", MagicMock)
+    monkeypatch.setattr(tree, "_PAUSE_LIMIT_S", 0.25)
+    monkeypatch.setattr(tree, "_LOOK_S", 0.0625)
+    with ExitStack() as stack:
+        client, asked, process, _far = (
+            stack.enter_context(one) for _ in range(2) for one in socket.socketpair()
+        )
+        made = tree.CheckpointTree({"checkpoints": 1, "memory_mib": 1}, Lines(asked), deque())
+        stack.callback(os.close, made._output)
+        stack.callback(os.close, made._output_end)
+        simulation = SimProcess(Lines(process), 0)
+        client.sendall(b'{"do": "pause"}\n')
+        made._wait_for(simulation, None)
+        monkeypatch.setattr(time, "monotonic", count(0, 60).__next__)
+        for _ in range(3):
+            made._wait_for(simulation, None)
+        with pytest.raises(Lost, match="did not come back"):
+            made._wait_for(simulation, None)
 
 
 @pytest.mark.long
