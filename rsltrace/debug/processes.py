@@ -78,13 +78,14 @@ class Family:
     def how_ended(self, process: SimProcess) -> str:
         """Return how a process has ended that has closed its socket."""
         end_s = time.monotonic() + _GRACE_S
-        while time.monotonic() < end_s:
+        while True:
             self.reap()
             status = self._ended.get(process.pid)
             if status is not None:
                 return f"its process {how_ended(os.waitstatus_to_exitcode(status))}"
+            if time.monotonic() > end_s:
+                return "its process does not answer any more"
             select.select([], [], [], 0.01)
-        return "its process does not answer any more"
 
     def kill(self, process: SimProcess) -> None:
         process.lines.close()

@@ -16,6 +16,8 @@ from rsltrace.line_protocol import Lines, Message
 _INTERVAL_S = 0.05
 _APART_LIMIT_S = 20.0
 _PAUSE_LIMIT_S = 5.0
+_LOOK_S = 0.2
+"""A wait counts for no more than that: a machine that stands still is no callback that hangs."""
 _NEARLY = 0.8
 _PIECE_BYTES = 1 << 16
 
@@ -52,8 +54,10 @@ class CheckpointTree:
         self._thinned_at = 0
         self._cursor: SimProcess
         self._is_quiet = False
-        self._paused_s: float | None = None
-        """When the client asked to stop what runs, in seconds of real time."""
+        self._left_s = 0.0
+        """How long what runs may still go on, if the client asked to stop it."""
+        self._recovers = False
+        """Whether it goes back to where it was, which is not to be stopped: it would be nowhere."""
         self._why_no_checkpoints = ""
         self._output, self._output_end = os.pipe()
         os.set_blocking(self._output, False)
@@ -132,6 +136,7 @@ class CheckpointTree:
         self.family.kill(self._cursor)
         index = int(before["index"])
         where = f"somewhere after event {index - 1}" if index else "at the start"
+        self._recovers, self._left_s = True, 0.0
         for is_last in (False, True):  # who kills one process may just have killed another
             try:
                 self._cursor, answer = self._at({"until": index})
@@ -143,6 +148,7 @@ class CheckpointTree:
                     raise SessionOverError(why) from None
             else:
                 break
+        self._recovers = False
         self.position = answer["position"]
         return Lost(f"the simulation was lost {where}: {error}; the session is back at {index}")
 
@@ -353,7 +359,7 @@ class CheckpointTree:
                 process.lines.send({"id": 0, **request})
             except OSError:
                 raise Lost(self.family.how_ended(process)) from None
-        self._paused_s = None
+        self._left_s = 0.0
         while True:
             message = self._message_of(process, limit_s)
             if "error" in message:
@@ -400,11 +406,15 @@ class CheckpointTree:
             ends.append(process.lines)
         if not self._client.ended:
             ends.append(self._client)
-        if self._paused_s is not None and process is not None:
-            limit_s = max(self._paused_s + _PAUSE_LIMIT_S - time.monotonic(), 0.0)
-        ready = select.select(ends, [], [], limit_s)[0]
-        if not ready:
-            self._paused_s = None
+        is_paused = process is not None and self._left_s > 0
+        began_s = time.monotonic()
+        ready = select.select(ends, [], [], _LOOK_S if is_paused else limit_s)[0]
+        is_over = not ready
+        if is_paused:
+            self._left_s -= min(time.monotonic() - began_s, _LOOK_S)
+            is_over = self._left_s <= 0
+        if is_over:
+            self._left_s = 0.0
             raise Lost("its callback did not come back, and was ended")
         if self._output in ready:
             self._pass_output_on()
@@ -418,9 +428,10 @@ class CheckpointTree:
         self._client.read()
         while (request := self._client.next()) is not None:
             if process is not None and request.get("do") == "pause":
-                process.lines.send({"id": 0, "do": "pause"})
-                if self._paused_s is None:  # a second Ctrl-C does not wait longer
-                    self._paused_s = time.monotonic()
+                # Once: a second Ctrl-C does not wait longer, and many would fill the socket.
+                if not self._left_s and not self._recovers:
+                    process.lines.send({"id": 0, "do": "pause"})
+                    self._left_s = _PAUSE_LIMIT_S
             else:
                 self._waiting.append(request)
         if self._client.ended and process is not None:

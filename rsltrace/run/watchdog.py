@@ -18,6 +18,7 @@ from _thread import allocate_lock, start_new_thread
 from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,9 @@ _LOOKS_BEFORE_END = 3
 _LOOKS_MAX = 250
 """Longer is not counted. (Python keeps one object of each number up to this forever.)"""
 
+_FRAMES_MAX = 100
+"""So many of our own at most: those of a recursion are too many to look at."""
+
 _JOIN_S = 1.0
 _raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
 _NO_PACKAGES: frozenset[str] = frozenset()
@@ -53,7 +57,7 @@ class Watchdog:
         self.has_warned = False
         """Whether a note on the current callback was printed."""
         self.signal = 0
-        """The signal that has ended the run, if one has."""
+        """The signal that has ended the run, until its callback was interrupted for that."""
         self._running = False
         self._stopping = allocate_lock()
         self._ended = allocate_lock()
@@ -96,7 +100,8 @@ class Watchdog:
             del loop
             if self.signal and still:
                 ending += 1
-                if ending == _LOOKS_BEFORE_END:
+                if ending >= _LOOKS_BEFORE_END and not self._is_handling_error():
+                    self.signal = 0  # once
                     # Not as a signal: ``timeout`` has sent two, and the third would kill.
                     _raise_in(ctypes.c_ulong(self._thread), ctypes.py_object(KeyboardInterrupt))
             since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
@@ -105,6 +110,12 @@ class Watchdog:
                     if self._tell(int(still * LOOK_EVERY_S)):
                         since_note, self.has_warned = 0, True
         self._ended.release()
+
+    def _is_handling_error(self) -> bool:
+        """Whether the callback is over already: what it raised is described, which takes seconds
+        after a deep recursion. (Another exception would leave the trace without its end.)"""
+        frames = islice(_frames(sys._current_frames().get(self._thread)), _FRAMES_MAX)
+        return any(frame.f_code is Dispatcher._raised.__code__ for frame in frames)
 
     def _tell(self, for_s: int) -> bool:
         """Report where the run is; return whether there was anything to report."""

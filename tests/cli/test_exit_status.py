@@ -15,7 +15,7 @@ B = A.with_name("b.mcap")
 pytestmark = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has /dev/full")
 
 FULL = ">/dev/full"
-CLOSED_PIPE = "| true; exit ${PIPESTATUS[0]}"
+CLOSED_PIPE = "; exit $?"  # to a pipe whose reader is gone
 NO_STDOUT = ">&-"
 NO_STDERR = "2>&-"
 FULL_STDERR = "2>/dev/full"
@@ -23,14 +23,20 @@ FULL_STDERR = "2>/dev/full"
 
 def run(words: str, redirect: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     words = words.replace("A", str(A)).replace("B", str(B))
-    return subprocess.run(
-        ["bash", "-c", f"{sys.executable} -m rsltrace {words} {redirect}"],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-        cwd=cwd,
-    )
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        return subprocess.run(
+            ["bash", "-c", f"{sys.executable} -m rsltrace {words} {redirect}"],
+            stdout=writing if redirect == CLOSED_PIPE else subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=300,
+            check=False,
+            cwd=cwd,
+        )
+    finally:
+        os.close(writing)
 
 
 @pytest.mark.few(1)

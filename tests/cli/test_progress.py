@@ -6,6 +6,7 @@ import os
 import pty
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -19,20 +20,18 @@ def test_progress_is_for_terminals(words: list[object], tmp_path: Path) -> None:
     command = [sys.executable, "-m", "rsltrace", *map(str, words)]
     main, side = pty.openpty()
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
-    shown = subprocess.run(
-        command, stdout=subprocess.PIPE, stderr=side, cwd=tmp_path, env=environment, check=True
-    )
-    os.close(side)
     seen = b""
-    while True:
-        try:
-            piece = os.read(main, 4096)
-        except OSError:  # the end of a terminal
-            break
-        if not piece:
-            break
-        seen += piece
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=side, cwd=tmp_path, env=environment
+    ) as shown:
+        os.close(side)
+        with suppress(OSError):  # the end of a terminal
+            while piece := os.read(main, 4096):
+                seen += piece
+        assert shown.stdout is not None
+        printed = shown.stdout.read()
     os.close(main)
+    assert shown.returncode == 0
     assert (b"writing bag" if "export" in words else b"checking") in seen
     quiet = subprocess.run(
         [*command, *(["--force"] if "export" in words else [])],
@@ -43,4 +42,4 @@ def test_progress_is_for_terminals(words: list[object], tmp_path: Path) -> None:
     )
     assert b"writing bag" not in quiet.stderr
     assert b"checking" not in quiet.stderr
-    assert b"\x1b" not in quiet.stderr + quiet.stdout + shown.stdout
+    assert b"\x1b" not in quiet.stderr + quiet.stdout + printed

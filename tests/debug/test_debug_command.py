@@ -11,7 +11,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -259,12 +260,33 @@ class Terminal:
             except OSError:
                 break
         os.close(self._end)
-        return os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
+        pid, self._pid = self._pid, 0
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+    def close(self) -> None:
+        """Kill it, unless it has ended."""
+        if self._pid:
+            os.kill(self._pid, signal.SIGKILL)
+            self.end()
+
+
+@pytest.fixture
+def on_terminal() -> Iterator[Callable[..., Terminal]]:
+    """Start the command on a terminal; it does not outlive the test."""
+    started: list[Terminal] = []
+
+    def start(folder: Path, *words: str) -> Terminal:
+        started.append(Terminal(folder, *words))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.close()
 
 
 @pytest.mark.long
-def test_a_session_on_a_terminal(folder: Path) -> None:
-    terminal = Terminal(folder, "run.mcap")
+def test_a_session_on_a_terminal(folder: Path, on_terminal: Callable[..., Terminal]) -> None:
+    terminal = on_terminal(folder, "run.mcap")
     terminal.until("(rsltrace) ")
     assert "did you mean '/smooth'?" in terminal.ask("break /smoth: data > 3")
     assert "breakpoint 1" in terminal.ask("break entity /smooth")
@@ -289,7 +311,9 @@ def test_a_session_on_a_terminal(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_ctrl_c_stops_the_run_and_not_the_session(folder: Path, tmp_path: Path) -> None:
+def test_ctrl_c_stops_the_run_and_not_the_session(
+    folder: Path, tmp_path: Path, on_terminal: Callable[..., Terminal]
+) -> None:
     long = tmp_path / "long"
     shutil.copytree(folder, long)
     job = (long / "job.yaml").read_text().replace("duration: 3s", "duration: 1000000s")
@@ -297,7 +321,7 @@ def test_ctrl_c_stops_the_run_and_not_the_session(folder: Path, tmp_path: Path) 
     nodes = (long / "nodes_of_debug.py").read_text()
     there = "        self.count += 1\n        if self.count == 100: open('there', 'w').close()\n"
     (long / "nodes_of_debug.py").write_text(nodes.replace("        self.count += 1\n", there))
-    terminal = Terminal(long, "job.yaml")
+    terminal = on_terminal(long, "job.yaml")
     terminal.until("(rsltrace) ")
     terminal.ask("step 10")
     terminal.type("continue\n")
@@ -317,8 +341,10 @@ def test_ctrl_c_stops_the_run_and_not_the_session(folder: Path, tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_a_session_that_is_killed_leaves_nobody(folder: Path) -> None:
-    terminal = Terminal(folder, "run.mcap")
+def test_a_session_that_is_killed_leaves_nobody(
+    folder: Path, on_terminal: Callable[..., Terminal]
+) -> None:
+    terminal = on_terminal(folder, "run.mcap")
     terminal.until("(rsltrace) ")
     terminal.ask("goto 100")
     family = descendants(terminal._pid)
@@ -334,9 +360,10 @@ def test_a_session_that_is_killed_leaves_nobody(folder: Path) -> None:
 def descendants(pid: int) -> list[int]:
     """Return the processes below one."""
     found = []
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        for word in (task / "children").read_text().split():
-            found += [int(word), *descendants(int(word))]
+    with suppress(OSError):  # it has ended, or a thread of it
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for word in (task / "children").read_text().split():
+                found += [int(word), *descendants(int(word))]
     return found
 
 

@@ -10,15 +10,22 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
 from rsltrace import DebugSession
+from rsltrace.debug import tree
 from rsltrace.debug.client import EditBranches
+from rsltrace.debug.processes import Lost, SimProcess
 from rsltrace.errors import DebugError, OutputError, RsltraceError
+from rsltrace.line_protocol import Lines
 
 pytestmark = pytest.mark.ros
 
@@ -241,15 +248,29 @@ def test_checkpoints_keep_within_their_bounds(job: Callable[..., Path], tmp_path
         assert found[0] == 0
 
 
+BEGUN = "Path(__file__).with_name('begun').touch()\n        "
+
+
+def paused_when_begun(session: DebugSession, folder: Path) -> threading.Thread:
+    """Pause a session when its node has done ``BEGUN``."""
+
+    def pause() -> None:
+        assert eventually((folder / "begun").exists)
+        session.pause()
+
+    thread = threading.Thread(target=pause)
+    thread.start()
+    return thread
+
+
 @pytest.mark.long
-def test_a_callback_that_does_not_come_back(job: Callable[..., Path]) -> None:
-    with DebugSession(job("while True: pass")) as session:
+def test_a_callback_that_does_not_come_back(job: Callable[..., Path], tmp_path: Path) -> None:
+    with DebugSession(job(f"{BEGUN}while True: pass")) as session:
         session.run_to(20)
-        timer = threading.Timer(1.0, session.pause)
-        timer.start()
+        pausing = paused_when_begun(session, tmp_path)
         with pytest.raises(DebugError, match=r"did not come back.* back at 20"):
             session.go_on()
-        timer.join()
+        pausing.join()
         assert session.step().position.index == 21
 
 
@@ -264,7 +285,7 @@ def test_an_endless_expression_ends_where_no_copy_can_be_made(
         stop = threading.Event()
 
         def keep_pressing() -> None:
-            while presses and not stop.wait(1.0):
+            while presses and not stop.wait(0.001):
                 session.pause()
 
         thread = threading.Thread(target=keep_pressing)
@@ -277,12 +298,11 @@ def test_an_endless_expression_ends_where_no_copy_can_be_made(
 
 
 @pytest.mark.long
-def test_a_run_is_paused_and_goes_on(job: Callable[..., Path]) -> None:
-    with DebugSession(job("pass", duration="3600s")) as session:
-        timer = threading.Timer(1.0, session.pause)
-        timer.start()
+def test_a_run_is_paused_and_goes_on(job: Callable[..., Path], tmp_path: Path) -> None:
+    with DebugSession(job(f"{BEGUN}pass", duration="1000000s")) as session:
+        pausing = paused_when_begun(session, tmp_path)
         stopped = session.go_on()
-        timer.join()
+        pausing.join()
         assert stopped.reason == "paused"
         index = stopped.position.index
         assert session.step().position.index == index + 1
@@ -386,9 +406,11 @@ def test_a_client_that_is_killed(job: Callable[..., Path]) -> None:
         pids[:] = marked()
         return len(pids) > 4 and any(_command(pid) == "sleep" for pid in pids)
 
-    assert eventually(has_begun)
-    client.kill()
-    client.wait()
+    try:
+        assert eventually(has_begun)
+    finally:
+        client.kill()
+        client.wait()
     assert gone(pids)
 
 
@@ -397,6 +419,46 @@ def _command(pid: int) -> str:
         return Path(f"/proc/{pid}/comm").read_text().strip()
     except OSError:
         return ""
+
+
+STALLS = """
+import itertools, os
+from rsltrace.debug import processes
+
+family = processes.Family()
+pid = os.posix_spawn("/bin/sh", ["sh", "-c", "kill -9 $$"], {})
+os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+processes.time.monotonic = itertools.count(0, 60).__next__
+print(family.how_ended(processes.SimProcess(None, pid)))
+"""
+
+
+def test_a_machine_that_stands_still_does_not_hide_how_a_process_ended() -> None:
+    done = subprocess.run([sys.executable, "-c", STALLS], capture_output=True, text=True)
+    assert done.stdout == "its process was killed by SIGKILL\n", done.stderr
+
+
+def test_a_machine_that_stands_still_does_not_end_a_callback(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tree, "Family", MagicMock)
+    monkeypatch.setattr(tree, "_PAUSE_LIMIT_S", 0.25)
+    monkeypatch.setattr(tree, "_LOOK_S", 0.0625)
+    with ExitStack() as stack:
+        client, asked, process, _far = (
+            stack.enter_context(one) for _ in range(2) for one in socket.socketpair()
+        )
+        made = tree.CheckpointTree({"checkpoints": 1, "memory_mib": 1}, Lines(asked), deque())
+        stack.callback(os.close, made._output)
+        stack.callback(os.close, made._output_end)
+        simulation = SimProcess(Lines(process), 0)
+        client.sendall(b'{"do": "pause"}\n')
+        made._wait_for(simulation, None)
+        monkeypatch.setattr(time, "monotonic", count(0, 60).__next__)
+        for _ in range(3):
+            made._wait_for(simulation, None)
+        with pytest.raises(Lost, match="did not come back"):
+            made._wait_for(simulation, None)
 
 
 @pytest.mark.long

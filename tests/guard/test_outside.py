@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from rsltrace.errors import GuardError, JobError, TraceError
+from rsltrace.guard import waiting
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.model.finding import GuardMode
@@ -337,10 +338,10 @@ def ask(node):
     subprocess.run(COMMAND, shell=True, stdout=subprocess.DEVNULL)
     said = [subprocess.check_output(COMMAND, shell=True, text=True)]
     closed = f'{COMMAND}; exec >&- 2>&-; {COMMAND}'
-    said.append(subprocess.run(closed, shell=True, capture_output=True, timeout=4).returncode)
+    said.append(subprocess.run(closed, shell=True, capture_output=True, timeout=700).returncode)
     with subprocess.Popen(['sh', '-c', COMMAND + '; exit 3']) as process: pass
     said.append(process.returncode)
-    said.append(subprocess.Popen(COMMAND + ' >&2; exit 4', shell=True).wait(timeout=4))
+    said.append(subprocess.Popen(COMMAND + ' >&2; exit 4', shell=True).wait(timeout=700))
     node.say(*said, node.ticks, time.time())
 def tick(node):
     node.ticks += 1
@@ -355,8 +356,9 @@ def main():
 @pytest.mark.long
 @pytest.mark.parametrize("mode", ["warn", "record"])
 def test_a_program_that_ends_soon_takes_no_simulated_time(
-    go: Callable[..., Any], tmp_path: Path, mode: str
+    go: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
+    monkeypatch.setattr(waiting, "_PROGRAM_S", 600.0)  # what is soon on a machine that stands still
     pace = tmp_path / "pace"
     code = node_code(
         "pass",

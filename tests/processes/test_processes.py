@@ -298,7 +298,7 @@ def test_a_process_that_does_not_come_back_is_named(
     monkeypatch.setattr(watchdog, "LOOK_EVERY_S", 0.2)
     monkeypatch.setattr(watchdog, "tell", say)
     assert run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error is None
-    (note,) = (note for note in notes if "/busy" in note)
+    note = next(note for note in notes if "/busy" in note)
     pattern = r"rsltrace: note: process \S*busy\S* \(pid \d+\), in /busy: timer timer 1, has "
     assert re.match(pattern, note)
     assert "stands still at 0.500000000 s. Ctrl-C" in note

@@ -165,6 +165,7 @@ def test_who_sleeps_until_a_ros_time_wakes_when_the_clock_shows_it(
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("own_domain")
 def test_it_is_as_over_dds(tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(CODE)
     done = subprocess.run(

@@ -68,8 +68,8 @@ HARMLESS = {
     "turns standard streams elsewhere": (
         "self.own = open('own', 'w'); [os.dup2(self.own.fileno(), n) for n in (0, 1, 2)]"
     ),
-    "sets an alarm": "signal.alarm(30)",  # more than a busy machine takes to the end
-    "sets a timer": "signal.setitimer(signal.ITIMER_REAL, 30, 0.5)",
+    "sets an alarm": "signal.alarm(3600)",  # more than a busy machine takes to the end
+    "sets a timer": "signal.setitimer(signal.ITIMER_REAL, 3600, 0.5)",
 }
 HARMFUL = {
     "deletes the trace": ("os.unlink('run.mcap')", "it was deleted"),
@@ -311,21 +311,21 @@ def test_a_hang_up_closes_the_trace_unless_it_is_ignored(
     job_file(JOB, NODE % wait)
     wanted = signal.SIG_IGN if ignored else signal.SIG_DFL
     command = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "run.mcap", "-q"]
-    process = subprocess.Popen(
+    out = tmp_path / "run.mcap"
+    with subprocess.Popen(
         command,
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=partial(signal.signal, signal.SIGHUP, wanted),  # nohup may have started us
-    )
-    out = tmp_path / "run.mcap"
-    while not (tmp_path / "waits").exists():
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.01)
-    process.send_signal(signal.SIGHUP)
-    (tmp_path / "go").touch()
-    output, errors = process.communicate(timeout=240)
+    ) as process:
+        while not (tmp_path / "waits").exists():
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.01)
+        process.send_signal(signal.SIGHUP)
+        (tmp_path / "go").touch()
+        output, errors = process.communicate(timeout=240)
     assert process.returncode == (0 if ignored else 129), errors
     assert ("hung up, closing the trace" in errors) is not ignored
     with Trace.open(out) as trace:

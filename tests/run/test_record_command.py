@@ -13,6 +13,8 @@ import subprocess
 import sys
 import termios
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -161,15 +163,56 @@ def test_an_exception_shows_the_users_traceback_and_exits_3(
     assert LAST_LINE.fullmatch(done.stdout.splitlines()[-1])
 
 
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
+    """Start a recording of ``job.yaml``, which does not outlive the test."""
+    with ExitStack() as stack:
+
+        def record() -> subprocess.Popen[str]:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "out.mcap"],
+                cwd=tmp_path,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            )
+            stack.enter_context(process)
+            stack.callback(process.kill)
+            return process
+
+        yield record
+
+
+@pytest.fixture
+def interrupted(start: Any) -> Callable[[], subprocess.Popen[str]]:
+    """Start a run whose callback hangs and prints ``stuck``, and interrupt it once."""
+
+    def interrupt() -> subprocess.Popen[str]:
+        process: subprocess.Popen[str] = start()
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "stuck\n"
+        process.send_signal(signal.SIGINT)
+        assert any("closing the trace" in line for line in process.stderr), "the first one has come"
+        return process
+
+    return interrupt
+
+
 ENDLESS = "nodes: [{node: nodes_under_test:Talker, arguments: {period: 0.0001}}]\n"
+NO_WATCHDOG = (
+    "from rsltrace.run import watchdog\n"
+    "watchdog._LOOKS_BEFORE_END = 10**9  # it is the second signal that ends the callback\n"
+)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_run_closes_its_file_and_says_so(
-    job_file: Any, tmp_path: Path, number: int, code: int
+    job_file: Any, tmp_path: Path, start: Any, number: int, code: int
 ) -> None:
     job_file(ENDLESS)
-    process = _start(tmp_path)
+    process = start()
     _wait_for_bytes(tmp_path / "out.mcap", 300_000)
     process.send_signal(number)
     stdout, stderr = process.communicate(timeout=300)
@@ -216,9 +259,9 @@ def test_a_trace_is_closed_that_was_interrupted_while_it_was_opened(
         assert trace.result["exit_code"] == "130"
 
 
-def test_a_killed_run_leaves_a_file_that_reads(job_file: Any, tmp_path: Path) -> None:
+def test_a_killed_run_leaves_a_file_that_reads(job_file: Any, tmp_path: Path, start: Any) -> None:
     job_file(ENDLESS)
-    process = _start(tmp_path)
+    process = start()
     _wait_for_bytes(tmp_path / "out.mcap", 300_000)
     process.kill()
     process.communicate(timeout=300)
@@ -230,7 +273,7 @@ def test_a_killed_run_leaves_a_file_that_reads(job_file: Any, tmp_path: Path) ->
 
 @pytest.mark.long
 def test_a_node_that_catches_signals_does_not_keep_a_run_from_ending(
-    job_file: Any, tmp_path: Path
+    job_file: Any, tmp_path: Path, start: Any
 ) -> None:
     job_file(
         ENDLESS.replace("Talker", "Deaf"),
@@ -240,7 +283,7 @@ def test_a_node_that_catches_signals_does_not_keep_a_run_from_ending(
         "        super().__init__(period)\n"
         "        signal.signal(signal.SIGINT, lambda number, frame: print('caught'))\n",
     )
-    process = _start(tmp_path)
+    process = start()
     _wait_for_bytes(tmp_path / "out.mcap", 10_000)
     process.send_signal(signal.SIGINT)
     stdout, _ = process.communicate(timeout=300)
@@ -251,15 +294,17 @@ def test_a_node_that_catches_signals_does_not_keep_a_run_from_ending(
 
 
 @pytest.mark.long
-def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_path: Path) -> None:
+def test_a_callback_that_hangs_is_left_by_a_second_interrupt(
+    job_file: Any, tmp_path: Path, interrupted: Any
+) -> None:
     job_file(
         "nodes: [{node: nodes_under_test:Stuck}]\n",
-        "class Stuck(Talker):\n"
+        NO_WATCHDOG + "class Stuck(Talker):\n"
         "    def tick(self):\n"
         "        print('stuck', flush=True)\n"
         "        while True: pass\n",
     )
-    process = _interrupted(tmp_path)
+    process = interrupted()
     assert process.poll() is None
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=300)
@@ -268,19 +313,22 @@ def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_
         assert trace.complete
 
 
-def test_a_second_interrupt_ends_an_endless_recursion(job_file: Any, tmp_path: Path) -> None:
+def test_a_second_interrupt_ends_an_endless_recursion(
+    job_file: Any, tmp_path: Path, interrupted: Any
+) -> None:
     job_file(
         "nodes: [{node: nodes_under_test:Stuck}]\n",
-        "class Stuck(Talker):\n"
+        NO_WATCHDOG + "class Stuck(Talker):\n"
         "    def tick(self):\n"
         "        import sys\n"
         "        sys.setrecursionlimit(10**9)\n"
         "        self.f(0)\n"
         "    def f(self, n):\n"
         "        if n == 200_000: print('stuck', flush=True)\n"
+        "        if n > 200_000: sum(range(10_000))  # or it takes all memory of a slow machine\n"
         "        self.f(n + 1)\n",
     )
-    process = _interrupted(tmp_path)
+    process = interrupted()
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=300)
     assert process.returncode == 130
@@ -290,27 +338,27 @@ def test_a_second_interrupt_ends_an_endless_recursion(job_file: Any, tmp_path: P
 
 @pytest.mark.long
 def test_a_third_interrupt_ends_a_process_that_swallows_the_second(
-    job_file: Any, tmp_path: Path
+    job_file: Any, tmp_path: Path, interrupted: Any
 ) -> None:
     job_file(
         "nodes: [{node: nodes_under_test:Stuck}]\n",
+        # A print that is interrupted may come again.
+        NO_WATCHDOG + "import os\n"
         "class Stuck(Talker):\n"
         "    def tick(self):\n"
-        "        print('stuck', flush=True)\n"
         "        while True:\n"
         "            try: self.work()\n"
-        "            except KeyboardInterrupt: print('swallowed', flush=True)\n"
+        "            except KeyboardInterrupt: os.write(1, b'swallowed\\n')\n"
         # Not in the try itself: what Python 3.11 raises where a loop jumps back to the first
         # instruction of a try, it raises outside of it.
         "    def work(self):\n"
+        "        os.write(1, b'stuck\\n')\n"
         "        while True: sum(range(9))\n",
     )
-    process = _interrupted(tmp_path)
-    _let_it_run(process.pid, 0.5)  # its handler is over
+    process = interrupted()
     process.send_signal(signal.SIGINT)
     assert process.stdout.readline() == "swallowed\n"
-    # What it swallowed may have been the watchdog's, and two signals that wait are one.
-    _let_it_run(process.pid, 0.2)
+    assert process.stdout.readline() == "stuck\n"
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=300)
     assert process.returncode == -signal.SIGINT
@@ -320,23 +368,25 @@ def test_a_third_interrupt_ends_a_process_that_swallows_the_second(
 
 @pytest.mark.long
 def test_a_third_interrupt_ends_a_recursion_that_leaves_no_room_for_handlers(
-    job_file: Any, tmp_path: Path
+    job_file: Any, tmp_path: Path, start: Any
 ) -> None:
     job_file(
         "nodes: [{node: nodes_under_test:Stuck}]\n",
-        "def f():\n"
+        # Each handler that fails ends a loop, and the one above it has a level more.
+        NO_WATCHDOG + "def f():\n"
         "    try: f()\n"
-        "    except RecursionError: f()\n"
+        "    except RecursionError:\n"
+        "        while True: sum(range(9))\n"
         "class Stuck(Talker):\n"
         "    def tick(self):\n"
         "        print('stuck', flush=True)\n"
         "        f()\n",
     )
-    process = _start(tmp_path)
+    process = start()
     assert process.stdout is not None
     assert process.stdout.readline() == "stuck\n"
     for _ in range(3):
-        _let_it_run(process.pid, 0.2)  # signals of one kind that wait are one
+        _let_it_run(process, 0.2)  # signals of one kind that wait are one
         process.send_signal(signal.SIGINT)
     process.communicate(timeout=300)
     assert process.returncode in (130, -signal.SIGINT)  # by the thread, or by the kernel
@@ -346,7 +396,7 @@ def test_a_third_interrupt_ends_a_recursion_that_leaves_no_room_for_handlers(
 
 @pytest.mark.long
 def test_an_interrupt_in_the_middle_of_a_log_ends_the_run_properly(
-    job_file: Any, tmp_path: Path
+    job_file: Any, tmp_path: Path, start: Any
 ) -> None:
     job_file(
         "nodes: [{node: nodes_under_test:Loud}]\n",
@@ -356,7 +406,7 @@ def test_an_interrupt_in_the_middle_of_a_log_ends_the_run_properly(
         "    def tick(self):\n"
         "        self.get_logger().info('x' * 1000)\n",
     )
-    process = _start(tmp_path)
+    process = start()
     status = Path(f"/proc/{process.pid}/stat")
     still = 0
     while still < 20:  # nobody reads what it says: sooner or later it waits in a write
@@ -406,38 +456,17 @@ def test_a_full_disk_ends_the_run_with_a_readable_file(job_file: Any, tmp_path: 
         assert trace.event_count >= 4096
 
 
-def _let_it_run(pid: int, seconds: float) -> None:
+def _let_it_run(process: subprocess.Popen[str], seconds: float) -> None:
     """Wait until a busy process has had so much time of the processor."""
 
     def spent_s() -> float:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     until = spent_s() + seconds
     while spent_s() < until:
+        assert process.poll() is None, process.communicate()
         time.sleep(0.05)
-
-
-def _start(folder: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "out.mcap"],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
-
-
-def _interrupted(folder: Path) -> subprocess.Popen[str]:
-    """Start a run whose callback hangs and prints ``stuck``, and interrupt it once."""
-    process = _start(folder)
-    assert process.stdout is not None
-    assert process.stderr is not None
-    assert process.stdout.readline() == "stuck\n"
-    process.send_signal(signal.SIGINT)
-    assert any("closing the trace" in line for line in process.stderr), "the first one has come"
-    return process
 
 
 def _wait_for_bytes(path: Path, size: int) -> None:

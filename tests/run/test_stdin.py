@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -183,7 +184,7 @@ def native(code: Path, name: str, slower: int) -> list[str]:
     if name == "lines":
         typed += ["\x04"] * 5
     until = time.monotonic() + 600
-    while not said and time.monotonic() < until:
+    while not said and time.monotonic() < until and process.poll() is None:
         time.sleep(0.05)
     time.sleep(1.0 * slower)
     for keys in typed:
@@ -195,7 +196,10 @@ def native(code: Path, name: str, slower: int) -> list[str]:
         while len(said) == before and time.monotonic() < until and process.poll() is None:
             time.sleep(0.05)
         time.sleep(0.3 * slower)
-    process.wait(600)
+    with suppress(subprocess.TimeoutExpired):  # a key was lost as it changed its terminal's mode
+        process.wait(60 * slower)
+    process.kill()
+    process.wait()
     listener.join()
     assert process.stderr is not None
     process.stderr.close()

@@ -242,6 +242,32 @@ def test_one_interrupt_ends_what_was_told_of(
     assert seen == went_on
 
 
+def test_a_callback_that_is_over_is_not_interrupted(busy: Looks, tmp_path: Path) -> None:
+    """A traceback takes seconds to write down, if a recursion was very deep."""
+    ends: list[Callable[[Stop], None]] = []
+
+    class Lengthy(KeyboardInterrupt):
+        @property
+        def __cause__(self) -> None:  # type: ignore[override]
+            busy(6)
+
+    class Raises(Node):
+        def __init__(self) -> None:
+            super().__init__("raises")
+            self.create_timer(1.0, self.tick)
+
+        def tick(self) -> None:
+            ends[0](Stop("interrupted", 130))  # as the command's signal handler does
+            raise Lengthy
+
+    job = rsltrace.Job(nodes=[rsltrace.NodeSpec(node=Raises)])
+    result = run(job, tmp_path / "a.mcap", observer=RunCallbacks(interrupt=ends.append))
+    assert result.exit_code == 130
+    with rsltrace.Trace.open(tmp_path / "a.mcap") as trace:
+        assert trace.complete
+        assert trace.event(1).flags.name == "RAISED"
+
+
 @pytest.mark.long
 def test_a_debugger_is_no_alarm(
     busy: Looks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -284,8 +310,11 @@ def test_it_is_gone_after_the_run(tmp_path: Path) -> None:
 def test_signals_end_a_busy_loop_with_a_whole_trace(
     tmp_path: Path, number: signal.Signals, at_once: int, later: int
 ) -> None:
+    patience = "10**9" if later else "watchdog._LOOKS_BEFORE_END"  # or the second comes too late
     (tmp_path / "busy_node.py").write_text(
         "from rclpy.node import Node\n"
+        "from rsltrace.run import watchdog\n"
+        f"watchdog._LOOKS_BEFORE_END = {patience}\n"
         "class Busy(Node):\n"
         "    def __init__(self):\n"
         "        super().__init__('busy')\n"
