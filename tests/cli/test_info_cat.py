@@ -667,3 +667,9 @@ def test_payloads_that_were_not_kept_are_no_error(tmp_path: Path) -> None:
     (event,) = objects(path, "--payloads")
     assert [out["sequence"] for out in event["outputs"]] == [None, None]
     assert "/t, call /s" in lines(path)[0]
+
+
+def test_a_table_of_long_names_has_its_columns_below_their_heads() -> None:
+    names = [f"/{'long' * 20}_{number}" for number in (8, 9, 10, 11)]
+    lines = table([("node", "events"), *((name, "7") for name in names)], right=frozenset((1,)))
+    assert {len(line) for line in lines} == {len(names[-1]) + 2 + len("events")}
