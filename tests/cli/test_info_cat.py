@@ -6,11 +6,14 @@ The texts people read are in ``golden/``. After a change that is meant, run this
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
+import struct
 import subprocess
 import sys
+import termios
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +35,7 @@ from trace_maker import (
 
 from rsltrace.cli.main import cli
 from rsltrace.guard.pin import THREAD_VARIABLES
-from rsltrace.terminal import terminal_width
+from rsltrace.terminal import tell, terminal_width
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
@@ -673,3 +676,22 @@ def test_a_table_of_long_names_has_its_columns_below_their_heads() -> None:
     names = [f"/{'long' * 20}_{number}" for number in (8, 9, 10, 11)]
     lines = table([("node", "events"), *((name, "7") for name in names)], right=frozenset((1,)))
     assert {len(line) for line in lines} == {len(names[-1]) + 2 + len("events")}
+
+
+def test_notes_on_a_terminal_break_at_words_and_commands_do_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 30, 0, 0))
+    with os.fdopen(theirs, "w") as screen:
+        monkeypatch.setattr(sys, "stderr", screen)
+        tell(
+            "rsltrace: note: an-event that is-not kept\n  rsltrace view run.mcap --at 12345678"
+        )
+        tell("next: rsltrace view run.mcap --at 12345678")
+        shown = os.read(ours, 1000).decode().replace("\r\n", "\n")
+    os.close(ours)
+    assert shown == (
+        "rsltrace: note: an-event that\nis-not kept\n"
+        "  rsltrace view run.mcap --at 12345678\nnext: rsltrace view run.mcap --at 12345678\n"
+    )

@@ -346,7 +346,8 @@ def measuring(
         sampling = [said for node, said in samplers(flow) if node not in wanted.via]
         notes += sampling[:_SAMPLERS_NAMED]
         if len(sampling) > _SAMPLERS_NAMED:
-            notes.append(f"so do {len(sampling) - _SAMPLERS_NAMED} more nodes; --via takes globs, too")
+            more = len(sampling) - _SAMPLERS_NAMED
+            notes.append(f"so do {more} more nodes; --via takes globs, too")
     yield Latencies(tuple(chains), tuple(notes), missing)
 
 
