@@ -685,9 +685,7 @@ def test_notes_on_a_terminal_break_at_words_and_commands_do_not(
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 30, 0, 0))
     with os.fdopen(theirs, "w") as screen:
         monkeypatch.setattr(sys, "stderr", screen)
-        tell(
-            "rsltrace: note: an-event that is-not kept\n  rsltrace view run.mcap --at 12345678"
-        )
+        tell("rsltrace: note: an-event that is-not kept\n  rsltrace view run.mcap --at 12345678")
         tell("next: rsltrace view run.mcap --at 12345678")
         shown = os.read(ours, 1000).decode().replace("\r\n", "\n")
     os.close(ours)
