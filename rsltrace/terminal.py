@@ -22,8 +22,22 @@ def say(text: str = "", *, end: str = "\n") -> None:
 def tell(text: str, *, end: str = "\n") -> None:
     """Write what is not the answer (errors, notes, progress) to stderr."""
     if sys.stderr is not None:
-        sys.stderr.write(printable_lines(f"{text}{end}"))
+        sys.stderr.write(_broken_at_words(printable_lines(f"{text}{end}")))
         sys.stderr.flush()
+
+
+def _broken_at_words(text: str) -> str:
+    """Break the first line of a note or an error at words if it goes to a terminal, which breaks
+    lines anywhere. Other lines stay: they are commands to be copied, or columns."""
+    first, *others = text.split("\n", 1)
+    if not first.startswith("rsltrace: ") or not sys.stderr.isatty():
+        return text
+    import os
+    import textwrap
+
+    width = os.get_terminal_size(sys.stderr.fileno()).columns or 80
+    words = textwrap.fill(first, width, break_long_words=False, break_on_hyphens=False)
+    return "\n".join([words, *others])
 
 
 def tell_notes(notes: Iterable[str]) -> None:

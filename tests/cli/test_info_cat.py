@@ -6,11 +6,15 @@ The texts people read are in ``golden/``. After a change that is meant, run this
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
+import struct
 import subprocess
 import sys
+import termios
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +36,7 @@ from trace_maker import (
 
 from rsltrace.cli.main import cli
 from rsltrace.guard.pin import THREAD_VARIABLES
-from rsltrace.terminal import terminal_width
+from rsltrace.terminal import tell, terminal_width
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
@@ -346,6 +350,7 @@ def test_cat_selects_by_time_both_ends_included(run: tuple[Path, Feeder]) -> Non
     assert indexes(path, "--from", "60ms", "--to", "100000000ns") == expected
     assert indexes(path, "--from", "0.060000001", "--to", "0.099999999") != expected
     assert indexes(path, "--from", "1h") == []
+    assert "--from is after the end of" in call("cat", path, "--from", "1h").stderr
     assert indexes(path, "--to", "@0") == []
 
 
@@ -373,9 +378,10 @@ def test_cat_selects_across_segments(tmp_path: Path) -> None:
         (["--node", "/talker", "--node", "x"], "has no node x; there are /listener, /talker"),
         (["--topic", "/x"], "has no topic or service /x; "),
         (["--entity", "99"], "has no entity 99; there are "),
+        (["--from", "0.1", "--to", "0.05"], "--to is before --from"),
     ],
 )
-def test_a_name_that_matches_nothing_is_an_error(
+def test_what_matches_nothing_is_an_error(
     run: tuple[Path, Feeder], words: list[str], said: str
 ) -> None:
     path, _ = run
@@ -671,3 +677,29 @@ def test_payloads_that_were_not_kept_are_no_error(tmp_path: Path) -> None:
     (event,) = objects(path, "--payloads")
     assert [out["sequence"] for out in event["outputs"]] == [None, None]
     assert "/t, call /s" in lines(path)[0]
+
+
+def test_a_table_of_long_names_has_its_columns_below_their_heads() -> None:
+    names = [f"/{'long' * 20}_{number}" for number in (8, 9, 10, 11)]
+    lines = table([("node", "events"), *((name, "7") for name in names)], right=frozenset((1,)))
+    assert {len(line) for line in lines} == {len(names[-1]) + 2 + len("events")}
+
+
+def test_notes_on_a_terminal_break_at_words_and_commands_do_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 30, 0, 0))
+    with os.fdopen(theirs, "w") as screen:
+        monkeypatch.setattr(sys, "stderr", screen)
+        tell("rsltrace: note: an-event that is-not kept\n  rsltrace view run.mcap --at 12345678")
+        tell("next: rsltrace view run.mcap --at 12345678")
+    shown = b""
+    with suppress(OSError):  # the other end is closed
+        while data := os.read(ours, 1000):
+            shown += data
+    os.close(ours)
+    assert shown.decode().replace("\r\n", "\n") == (
+        "rsltrace: note: an-event that\nis-not kept\n"
+        "  rsltrace view run.mcap --at 12345678\nnext: rsltrace view run.mcap --at 12345678\n"
+    )

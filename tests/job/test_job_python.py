@@ -77,6 +77,7 @@ def test_paths_are_relative_to_the_current_folder(
     ("build", "message"),
     [
         (lambda: NodeSpec(node="Talker"), "NodeSpec: node: expected module:Class or module:function, got 'Talker'"),
+        (lambda: NodeSpec(node="a.talker"), "NodeSpec: node: expected module:Class or module:function, got 'a.talker'; write a.talker:Class, or a:talker"),
         (lambda: NodeSpec(node=3), "NodeSpec: node: expected module:Class or module:function, got the number 3"),
         (lambda: NodeSpec(nod="m:N"), "NodeSpec: unknown key 'nod'; did you mean 'node'?"),
         (lambda: StopSpec(duration=1, duration_ns=1), "StopSpec: duration_ns: give either duration or duration_ns, not both"),

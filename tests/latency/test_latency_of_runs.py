@@ -183,6 +183,25 @@ def call(*arguments: object) -> Result:
     return CliRunner().invoke(cli, ["latency", *map(str, arguments)])
 
 
+class Sampler(Node):
+    """Publishes by a timer, and receives what it and others publish."""
+
+    def __init__(self) -> None:
+        super().__init__("sampler")
+        publisher = self.create_publisher(Int64, "/x", 10)
+        self.create_subscription(Int64, "/x", lambda _: None, 10)
+        self.create_timer(0.1, lambda: publisher.publish(Int64()))
+
+
+def test_of_many_nodes_that_sample_some_are_named(tmp_path: Path) -> None:
+    nodes = tuple(NodeSpec(node=Sampler, name=f"n{number}") for number in range(9))
+    record(Job(nodes=nodes, stop=StopSpec(duration="200ms")), tmp_path / "many.mcap")
+    found = call(tmp_path / "many.mcap")
+    assert found.exit_code == 2
+    assert found.output.count("with no message as the cause") == 3
+    assert "so do 6 more nodes" in found.output
+
+
 def test_the_command_finds_chains_and_says_where_one_breaks(run: Path) -> None:
     found = call(run)
     assert found.exit_code == 0, found.output

@@ -273,8 +273,10 @@ return LaunchDescription([
         ),
         (
             "from launch_ros.actions import Nod",
-            "ImportError: cannot import name 'Nod' from 'launch_ros.actions'",
+            "there is no launch_ros.actions.Nod; did you mean 'Node'?",
         ),
+        ("from launch_ros import actoins", "did you mean 'launch_ros.actions'?"),
+        ("launch.actions.Node()", "did you mean 'launch_ros.actions.Node'?"),
         (
             "launch.actions.TimerActoin()",
             "there is no launch.actions.TimerActoin; did you mean 'TimerAction'?",

@@ -75,6 +75,43 @@ def test_log_records_lead_to_the_events_that_logged_them(long_run: Run) -> None:
     assert event_of(long_run, nowhere) is None
 
 
+@pytest.fixture
+def many_alike(tmp_path: Path) -> Path:
+    """Nodes with long names that share a beginning, which all log at the same instant."""
+    from trace_maker import LOG_SCHEMA, Opened, log_message
+
+    with Opened(tmp_path / "alike.mcap") as feeder:
+        channel = feeder.writer.add_channel("/rosout", "rcl_interfaces/msg/Log", LOG_SCHEMA)
+        log = log_message(5, 30, "node", "low")
+        for number in range(12):
+            node = feeder.entity(EntityKind.NODE, f"/front_left/sensing/lidar/detector_{number:02}")
+            timer = feeder.entity(EntityKind.TIMER, "tick", node=node)
+            feeder.output(OutputKind.LOG, node, log, feeder.payload(channel, 5, log))
+            feeder.event(EventKind.TIMER, timer, 5)
+        feeder.writer.close(result={"stop_reason": "done", "exit_code": "0"})
+    return tmp_path / "alike.mcap"
+
+
+def test_a_record_is_found_among_many_of_an_instant_without_reading_each_event(
+    many_alike: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run.open(many_alike)
+    lines = list(read_logs(run))[-1].lines
+    made = []
+    monkeypatch.setattr("rsltrace_viewer.model.run.output_of", lambda row, _: made.append(row))
+    assert [event_of(run, line) for line in lines] == list(range(12))
+    assert len(made) <= len(lines)
+    run.close()
+
+
+def test_the_overview_cuts_names_where_they_still_differ(many_alike: Path, drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        for number in range(5):
+            assert f"detector_{number:02}  " in viewer.text.replace("█", " ")
+
+    drive(many_alike, steps, overview=True, size=(60, 40))
+
+
 def test_the_overview_says_how_long_callbacks_took_and_what_was_lost(tmp_path: Path) -> None:
     from trace_maker import Opened
 

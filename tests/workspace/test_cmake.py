@@ -195,8 +195,19 @@ _TRIPLED = 'set(a "${a}${a}${a}")\n' * 40
         f"if({'NOT ' * 5000}TRUE)\nendif()\n",
         f'if("{"a" * 40}" MATCHES "(a+)+b")\nendif()\n',
         f'if("{"a" * 40}" MATCHES "{"a?" * 40}{"a" * 40}")\nendif()\n',
+        f"set(t {'a' * 300})\n" + 'if(t MATCHES ".*.*.*x")\nendif()\n' * 5000,
+        "x([[" * 200_000,
+        f"x({'${' * 400_000}",
+        f'x("{chr(92) * 999_001}',
+        f"list(APPEND a{' b' * 100_000})\nlist(REMOVE_ITEM a{' c' * 100_000})\n",
+        "file(GLOB_RECURSE a *)\n" * 20_000,
+        f"list(APPEND a{' b' * 9999})\nforeach(i ${{a}})\nif(OFF)\n{'x()' * 99_999}\nendif()\n",
+        f"list(APPEND a{' b' * 9999})\nforeach(i ${{a}})\nif(OFF)\n{'elseif(OFF)' * 50_000}\n",
     ],
-    ids=["tripled", "appended", "replaced", "nested", "negated", "matched", "optional"],
+    ids=[
+        *("tripled", "appended", "replaced", "nested", "negated", "matched", "optional"),
+        *("stars", "brackets", "braces", "backslashes", "removed", "globs", "skipped", "branches"),
+    ],
 )
 def test_small_files_that_mean_enormous_ones_end(package: SourcePackage, text: str) -> None:
     text = f"set(a aaaaaaaaaaaaaaaaaaaa)\ncalled(first)\n{text}"

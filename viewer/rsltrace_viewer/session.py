@@ -395,8 +395,8 @@ class Session:
             logs = Logs([])
             for logs in read_logs(run):
                 yield len(logs.lines)
-            yield from mark_lanes(run, maker, logs)
             self.logs[name] = logs
+            yield from mark_lanes(run, maker, logs)
 
     def survey(self) -> Iterator[float]:
         """Count each run for its overview, a segment at a time, hold its checks against it and

@@ -11,7 +11,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import SequenceMatcher
 from importlib.util import find_spec
@@ -153,21 +153,29 @@ class _LaunchModule(ModuleType):
         """Return a class that refuses to be used: a launch file may import what it never uses."""
         if name.startswith("_") or not name[:1].isupper():
             raise AttributeError(f"rsltrace has no {self.__name__}.{name}")
-        near = nearest(name, vars(self)) or ""
-        if SequenceMatcher(None, name, near).ratio() * (total := len(name) + len(near)) > total - 4:
-            raise AttributeError(f"there is no {self.__name__}.{name}; did you mean {near!r}?")
-        return _refused(f"{self.__name__}.{name}")
+        near = nearest(name, vars(self))
+        total = len(name) + len(near or "")
+        if near and SequenceMatcher(None, name, near).ratio() * total > total - 4:
+            # "from ... import" would lose the text of an AttributeError.
+            raise ImportError(f"there is no {self.__name__}.{name}; did you mean {near!r}?")
+        places = [place for place, names in _MODULES.items() if name in names]
+        return _refused(f"{self.__name__}.{name}", [f"{place}.{name}" for place in places[:1]])
 
 
-def _refused(name: str) -> type:
+def _refused(name: str, meant: Sequence[str]) -> type:
     def refuse(*_: Any, **__: Any) -> None:
-        raise JobError(
-            f"{name}: this part of ROS's launch is not among what rsltrace knows: source a ROS 2 "
-            "installation, or name the nodes in the job",
-            where=basics.calling_line(),
-        )
+        raise _unknown("part", name, meant)
 
     return type(name.rpartition(".")[2], (), {"__init__": refuse})
+
+
+def _unknown(what: str, name: str, meant: Iterable[str]) -> JobError:
+    known = "".join(f"did you mean {one!r}? Else " for one in meant)
+    return JobError(
+        f"{name}: this {what} of ROS's launch is not among what rsltrace knows: {known}source a "
+        "ROS 2 installation, or name the nodes in the job",
+        where=basics.calling_line(),
+    )
 
 
 def _submodules(modules: Mapping[str, dict[str, Any]]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -194,11 +202,7 @@ class _LaunchModuleFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         if name.rpartition(".")[2][:1].isupper():  # a class that is not there
             return None
         if name not in self._modules:
-            raise JobError(
-                f"{name}: this module of ROS's launch is not among what rsltrace knows: source a "
-                "ROS 2 installation, or name the nodes in the job",
-                where=basics.calling_line(),
-            )
+            raise _unknown("module", name, filter(None, [nearest(name, self._modules)]))
         return importlib.machinery.ModuleSpec(name, self, is_package=True)
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:

@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from glob import glob
 from itertools import pairwise
+from math import comb
 from pathlib import Path
 
 from rsltrace.source_packages import SourcePackage
@@ -26,14 +27,21 @@ from rsltrace.source_packages import SourcePackage
 _COMMANDS_MAX = 20_000
 """What a file may come to: a recursion has no end of its own."""
 _CHARACTERS_MAX = 20_000_000
-"""How long the values that it uses may be in all: a list may double in each line."""
+"""How long the values that it uses may be in all: a list may double in each line. Other work is
+counted in such characters, too."""
+_TEXT_MAX = 1_000_000
+_GLOB_CHARACTERS, _SKIPPED_CHARACTERS = 20_000, 10
+_FREE_MAX, _PATTERN_MAX = 4, 1000
+_STEPS_PER_CHARACTER = 50
+"""Steps of a regular expression that take as long as using a character does."""
 _BLOCKS_MAX = 30
 _CONDITION_WORDS_MAX = 100
-_MATCHED_CHARACTERS_MAX = 300
+# What is not closed goes on to the end, so that no part of a text is looked through twice.
 _TOKEN = re.compile(
-    r"""(?P<space>[\s;]+)|\#\[(?P<comment_mark>=*)\[.*?\](?P=comment_mark)\]|(?P<comment>\#[^\n]*)
-    |\[(?P<mark>=*)\[\n?(?P<bracket>.*?)\](?P=mark)\]|"(?P<quoted>(?:[^"\\]|\\.)*)"
-    |(?P<parenthesis>[()])|(?P<plain>(?:[^\s;()"#\\$]|\\.|\$\{[^}\s]*\}|\$<[^>\s]*>|\$)+)|(?P<odd>.)""",
+    r"""(?P<space>[\s;]+)|\#\[(?P<comment_mark>=*)\[.*?(?:\](?P=comment_mark)\]|\Z)
+    |(?P<comment>\#[^\n]*)|\[(?P<mark>=*)\[\n?(?P<bracket>.*?)(?:\](?P=mark)\]|\Z)
+    |"(?P<quoted>(?:[^"\\]+|\\.?)*)(?:"|\Z)|(?P<parenthesis>[()])
+    |(?P<plain>(?:[^\s;()"#\\$]+|\\.|\$\{[^}\s]*\}?|\$<[^>\s]*>?|\$)+)|(?P<odd>.)""",
     re.VERBOSE | re.DOTALL,
 )
 _COMMAND = re.compile(r"([A-Za-z_]\w*)[ \t\n]*\(")
@@ -99,18 +107,17 @@ def _read(file: Path) -> list[_WrittenCommand]:
     """Return the commands of a file; nothing if it cannot be read. Its text may be anything: what
     is not a command is passed over."""
     try:
-        text = file.read_text("utf-8", "replace")
+        with file.open(encoding="utf-8", errors="replace") as opened:
+            text = opened.read(_TEXT_MAX)
     except OSError:
         return []
     found = []
-    position = 0
+    position, counted, line = 0, 0, 1
     while match := _next_command(text, position):
         words, position = _arguments(text, match.end())
-        found.append(
-            _WrittenCommand(
-                match[1].lower(), tuple(words), file, text.count("\n", 0, match.start()) + 1
-            )
-        )
+        line += text.count("\n", counted, match.start())
+        counted = match.start()
+        found.append(_WrittenCommand(match[1].lower(), tuple(words), file, line))
     return found
 
 
@@ -215,6 +222,7 @@ class _CMakeInterpreter:
             index += 1
             if call.name in _ENDS:
                 end = _end_of(calls, index, call.name)
+                self._may_use(_SKIPPED_CHARACTERS * (end - index))
                 self._block(call, list(calls[index:end]))
                 index = end + 1
             else:
@@ -250,6 +258,7 @@ class _CMakeInterpreter:
             else:
                 heads[-1][1].append(one)
         for head, part in heads:
+            self._left -= 1
             holds = True if head.name == "else" else self._holds(list(head.words))
             if holds is not False:
                 yield part
@@ -355,13 +364,15 @@ class _CMakeInterpreter:
         elif kind == "PREPEND":
             items = rest + items
         elif kind == "REMOVE_ITEM":
-            items = [one for one in items if one not in rest]
-        elif kind == "FILTER" and len(rest) == 3 and (wanted := _pattern(rest[2])):
-            wanted_is = rest[0] == "INCLUDE"
-            if max(map(len, items), default=0) > _MATCHED_CHARACTERS_MAX:
+            removed = set(rest)
+            items = [one for one in items if one not in removed]
+        elif kind == "FILTER" and len(rest) == 3:
+            matches = [self._matches(rest[2], one) for one in items]
+            if None in matches:
                 self._forget(name)
                 return
-            items = [one for one in items if bool(wanted.search(one)) is wanted_is]
+            wanted_is = rest[0] == "INCLUDE"
+            items = [one for one, found in zip(items, matches, strict=True) if found is wanted_is]
         else:
             self._forget_all(words)
             return
@@ -396,6 +407,8 @@ class _CMakeInterpreter:
             place = Path(os.path.normpath(self._folder / pattern))
             if not place.is_relative_to(self._top):
                 continue  # all of the machine may be there
+            if not self._may_use(_GLOB_CHARACTERS):
+                return
             if kind == "GLOB":
                 files |= {Path(one) for one in glob(str(place))}
             else:
@@ -491,18 +504,20 @@ class _CMakeInterpreter:
         with an X that nobody here has set) would grow with each use.
         """
         opened: list[str] = []
-        parts = [""]
+        parts: list[list[str]] = [[]]
         for token in _BRACES.split(text):
             if token[:1] == "$" and token[-1:] == "{":
                 opened.append(token)
-                parts.append("")
+                parts.append([])
             elif token == "}" and opened:
-                name, opening = parts.pop(), opened.pop()
+                name, opening = "".join(parts.pop()), opened.pop()
                 value = self._value(name) if opening == "${" else None
-                parts[-1] += f"{opening}{name}}}" if value is None else value
+                parts[-1].append(f"{opening}{name}}}" if value is None else value)
             else:
-                parts[-1] += token
-        return parts[0] + "".join(map("".join, zip(opened, parts[1:], strict=True)))
+                parts[-1].append(token)
+        return "".join(
+            begun + "".join(part) for begun, part in zip(("", *opened), parts, strict=True)
+        )
 
     # -- conditions ------------------------------------------------------------------------------
 
@@ -547,11 +562,26 @@ class _CMakeInterpreter:
                 return None
             if texts[1] != "MATCHES":
                 return left == right
-            pattern = _pattern(right)
-            if pattern is None or len(left) > _MATCHED_CHARACTERS_MAX:
-                return None
-            return pattern.search(left) is not None
+            return self._matches(right, left)
         return None
+
+    def _matches(self, pattern: str, text: str) -> bool | None:
+        """Return whether one of CMake's regular expressions is found in a text; None if Python has
+        none of that kind, or if it may take long.
+
+        Each repetition, and the place to begin at, may stop anywhere in the text. Groups must not
+        be repeated: that may take for ever.
+        """
+        free = len(re.findall(r"[*+?{]", pattern)) + 1
+        if free > _FREE_MAX or len(pattern) > _PATTERN_MAX or re.search(r"\)[*+?{]", pattern):
+            return None
+        steps = comb(len(text) + free, free) * len(pattern)
+        if steps > _CHARACTERS_MAX or not self._may_use(steps // _STEPS_PER_CHARACTER):
+            return None
+        try:
+            return re.search(pattern, text) is not None
+        except re.error:
+            return None
 
     def _truth(self, text: str, *, is_plain: bool) -> bool | None:
         if text.upper() in _TRUE:
@@ -572,17 +602,6 @@ def _end_of(calls: Sequence[_WrittenCommand], index: int, name: str) -> int:
         if depth == 0:
             return place
     return len(calls)
-
-
-def _pattern(text: str) -> re.Pattern[str] | None:
-    """Return one of CMake's regular expressions, None if Python has none of that kind, or if it
-    may take for ever: it repeats groups, or much."""
-    if re.search(r"\)[*+?{]", text) or len(re.findall(r"[*+?{]", text)) > 3:
-        return None
-    try:
-        return re.compile(text)
-    except re.error:
-        return None
 
 
 def _unescaped(text: str) -> str:

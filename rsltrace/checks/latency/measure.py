@@ -31,6 +31,7 @@ from rsltrace.trace.words.entities import is_named
 
 # Where a chain breaks off: a node takes a message, and what it publishes has another cause.
 
+_SAMPLERS_NAMED = 3
 _Graph = dict[str, list[Hop]]
 """By topic: the nodes that receive it, with each topic that these publish."""
 
@@ -342,7 +343,11 @@ def measuring(
         for node in wanted.via
     ]
     if wanted.first is None and wanted.last is None:
-        notes += [said for node, said in samplers(flow) if node not in wanted.via]
+        sampling = [said for node, said in samplers(flow) if node not in wanted.via]
+        notes += sampling[:_SAMPLERS_NAMED]
+        if len(sampling) > _SAMPLERS_NAMED:
+            more = len(sampling) - _SAMPLERS_NAMED
+            notes.append(f"so do {more} more nodes; --via takes globs, too")
     yield Latencies(tuple(chains), tuple(notes), missing)
 
 

@@ -114,7 +114,10 @@ def _as_target(text: str) -> str:
             return f"; add {folder or '/'} to search_path and write {file}:{attribute}"
         return f"; a module is named with dots: {module}:{attribute or 'Class'}"
     module, dot, last = text.rpartition(".")
-    return f"; write {module}:{last}" if dot and re.fullmatch(_TARGET, f"{module}:{last}") else ""
+    if not dot or not re.fullmatch(_TARGET, f"{module}:{last}"):
+        return ""
+    in_module = "" if last[:1].isupper() else f"{text}:Class, or "
+    return f"; write {in_module}{module}:{last}"
 
 
 def check_executable(name: str) -> None:

@@ -28,14 +28,11 @@ def table(
     """Return ``rows`` as lines with aligned columns, two spaces between them.
 
     ``right`` has the columns that are aligned to the right. No line ends in spaces. A cell that is
-    very long pushes the rest of its line to the right, not that of all lines. If lines are longer
+    very long, unlike most, pushes the rest of its line to the right, not all. If lines are longer
     than ``width``, the ``optional`` columns are left out, one after the other.
     """
     cells = [list(row) for row in rows]
-    widths = {
-        place: max((len(cell) for cell in column if len(cell) <= _COLUMN_MAX), default=0)
-        for place, column in enumerate(zip(*cells, strict=True))
-    }
+    widths = {place: _width(column) for place, column in enumerate(zip(*cells, strict=True))}
     for place in optional:
         if width is not None and sum(widths.values()) + 2 * (len(widths) - 1) > width:
             del widths[place]
@@ -47,6 +44,13 @@ def table(
         ]
         lines.append("  ".join(padded).rstrip())
     return lines
+
+
+def _width(column: Sequence[str]) -> int:
+    lengths = sorted(map(len, column))
+    usual = lengths[len(lengths) // 2]
+    longest = 2 * usual if usual > _COLUMN_MAX else _COLUMN_MAX
+    return max((length for length in lengths if length <= longest), default=0)
 
 
 _ACTION = "/_action/"

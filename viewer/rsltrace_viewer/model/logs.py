@@ -73,12 +73,16 @@ def event_of(run: Run, line: LogLine) -> int | None:
     """Return the event that logged a record; None if it cannot be found. Raises TraceError."""
     if not run.count:
         return None
-    index = run.index_at(line.stamp_ns)
-    while index < run.count and run.stamp(index) == line.stamp_ns:
-        for output in run.outputs(index):
-            if output.kind is OutputKind.LOG and output.sequence == line.sequence:
-                return index
-        index += 1
+    # In columns, not event by event: an instant may have thousands of events that log.
+    for number in range(run.segment_of(run.index_at(line.stamp_ns)), len(run.segments)):
+        if run.segments[number]["start_stamp"] > line.stamp_ns:
+            break
+        run.outputs(int(run.segments[number]["first_event"]))  # raises if they are damaged
+        outputs = run.segment_outputs(number)
+        logged = (outputs["kind"] == int(OutputKind.LOG)) & (outputs["sequence"] == line.sequence)
+        for index in outputs["event"][logged].tolist():
+            if run.stamp(index) == line.stamp_ns:
+                return int(index)
     return None
 
 

@@ -29,6 +29,7 @@ from rsltrace_viewer.model.overview import (
     unheard_of,
 )
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.timeline.columns import ShortNames
 from rsltrace_viewer.model.view import cells, fit, wrap
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.keys import KEYS
@@ -276,6 +277,7 @@ class OverviewScreen(Screen[Choice | None]):
         heads += [(f"{words:>{_TIMES}}", "muted") for words, _ in columns]
         yield heads, None
         largest = max((_some(row).share for row in rows), default=0) or 1
+        short = ShortNames(_name(row, field) for row in rows)
         most = len(rows)
         if field not in self._whole:
             shown = (self.app.size.height - _OTHER_LINES) // 3
@@ -284,7 +286,7 @@ class OverviewScreen(Screen[Choice | None]):
             some = _some(row)
             bar = "█" * round(some.share * bars / largest) or "▏"
             colour = None if field == "topic" else self._session.node_colours.get(some.node)
-            pieces = [node_piece(fit(_name(row, field), names) + " ", colour)]
+            pieces = [node_piece(short.fit(_name(row, field), names) + " ", colour)]
             pieces.append((fit(bar, bars) + " ", "bar"))
             differ = len({part.count if part else 0 for part in row}) > 1
             pieces += [(_numbers(part), "error" if differ else "plain") for part in row]
