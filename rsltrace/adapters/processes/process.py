@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from rsltrace.adapters.processes import graph_answers
@@ -69,6 +69,17 @@ _WROTE = "wrote something of its own to"
 Question = Callable[[RecordReader], bytes]
 
 
+def _as_traceback(stack: Sequence[str]) -> str:
+    """Return lines of a C++ stack as Python prints its own."""
+    lines = ["Traceback (most recent call last):\n"] if stack else []
+    for one in reversed(stack):
+        place, _, function = one.partition(" in ")
+        file, _, number = place.rpartition(":")
+        line = f'"{file}", line {number}, in {function}' if function else f'"{place}"'
+        lines.append(f"  File {line}\n")
+    return "".join(lines)
+
+
 class ProcessRun(EntityFactory, Protocol):
     """What a process finds in its run."""
 
@@ -130,6 +141,8 @@ class Process:
         self._waking_soon = False
         self._last: WaitableEntity | None = None
         self._is_stopping = False
+        self._crashed_at: list[str] = []
+        """The lines of its own code, innermost first."""
         self._graph = GraphChange(self)
         adapter.domain.graph.changed.append(self._graph.note)
         self._questions: dict[int, Question] = {
@@ -159,6 +172,7 @@ class Process:
             RecordKind.ALIVE: self._alive,
             RecordKind.UNSEEN: self._unseen,
             RecordKind.DRAW: self._draw,
+            RecordKind.CRASH: self._crash,
             RecordKind.DROPPED: lambda fields: self.things[fields.number()].drop(),
         }
 
@@ -375,9 +389,17 @@ class Process:
         text = f"{happened}; the last that it ran was {last}"
         if self.log_failure:
             self.adapter.log(40, self.name, text)
+            if self._crashed_at:
+                note = f"process {self.name} crashed at {self._crashed_at[0]}"
+                self.adapter.domain.outcome.notes.append(note)
         else:
-            now_ns = self.dispatcher.loop.now_ns
-            raise NodeError(text, node="", entity=self.name, stamp_ns=now_ns, traceback_text="")
+            raise NodeError(
+                text,
+                node="",
+                entity=self.name,
+                stamp_ns=self.dispatcher.loop.now_ns,
+                traceback_text=_as_traceback(self._crashed_at),
+            )
 
     def stop(self) -> None:
         """Tell it as whoever starts nodes does that the run is over (Ctrl-C), and end it once it
@@ -501,6 +523,9 @@ class Process:
         running = self._running_node()
         node = running.key if running is not None else ""
         self.adapter.note_answer(source, call, answer, stack_text(fields.rest()), node, calls)
+
+    def _crash(self, fields: RecordReader) -> None:
+        self._crashed_at = stack_text(fields.rest()).splitlines()
 
     def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()
