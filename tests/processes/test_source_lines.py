@@ -64,8 +64,9 @@ def test_a_template_of_a_library_is_no_line_of_the_program(tmp_path: Path) -> No
 
 
 _CRASHES = """
+#include <csignal>
 #include <stdexcept>
-#include <string>
+#include <unistd.h>
 volatile int *nowhere;
 int deeper(int n) {
   volatile char room[4096] = {};
@@ -75,24 +76,32 @@ void crash(const std::string &how) {
   if (how == "fault") *nowhere = 1;
   if (how == "throw") throw std::runtime_error("wheel lost");
   if (how == "recursion") deeper(0);
+  std::signal(SIGINT, [](int) {});
+  sleep(9);
+  *nowhere = 1;
 }
 int main(int, char **words) { crash(words[1]); }
 """
 
 
-@pytest.mark.parametrize(
-    ("how", "line"), [("fault", 10), ("throw", 11), pytest.param("recursion", 5, marks=_long)]
-)
-def test_a_process_that_crashes_is_reported_with_its_lines(
-    tmp_path: Path, how: str, line: int
-) -> None:
+def _crashing(folder: Path) -> str:
     try:
         compiler = find_compiler()
     except SetupError as error:
         pytest.skip(str(error))
-    (tmp_path / "robot.cpp").write_text(_CRASHES)
-    words = ["-g", str(tmp_path / "robot.cpp"), "-o", str(tmp_path / "robot")]
+    (folder / "robot.cpp").write_text(_CRASHES)
+    words = ["-g", str(folder / "robot.cpp"), "-o", str(folder / "robot")]
     subprocess.run([*compiler, *words], check=True)
+    return "robot"
+
+
+@pytest.mark.parametrize(
+    ("how", "line"), [("fault", 11), ("throw", 12), pytest.param("recursion", 6, marks=_long)]
+)
+def test_a_process_that_crashes_is_reported_with_its_lines(
+    tmp_path: Path, how: str, line: int
+) -> None:
+    _crashing(tmp_path)
     job = f"nodes: [{{program: robot, arguments: [{how}]}}]\nstop: {{duration: 1s}}\n"
     (tmp_path / "job.yaml").write_text(job)
     error = run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error
@@ -101,10 +110,22 @@ def test_a_process_that_crashes_is_reported_with_its_lines(
     assert head == "Traceback (most recent call last):"
     assert re.fullmatch(rf'  File "robot.cpp", line {line}, in \w+\(.*\)', frames[-1])
     if how != "recursion":
-        assert frames[0] == '  File "robot.cpp", line 14, in main'
+        assert frames[0] == '  File "robot.cpp", line 18, in main'
     with Trace.open(tmp_path / "t.mcap") as trace:
         raised = [o for o in trace.outputs_of(0) if o.kind is OutputKind.EXCEPTION]
         assert (trace.detail(raised[0]) or "").startswith(error.traceback_text)
     (tmp_path / "job.yaml").write_text(job.replace("]}", "], on_exception: log}"))
     notes = run(load_job(tmp_path / "job.yaml"), tmp_path / "u.mcap").notes
     assert any(f"crashed at robot.cpp:{line} in " in note for note in notes)
+
+
+def test_a_crash_when_the_run_is_over_is_a_note(tmp_path: Path) -> None:
+    name = _crashing(tmp_path)
+    (tmp_path / "job.yaml").write_text(
+        f"nodes: [{{program: {name}, arguments: [late]}}]\nstop: {{duration: 1s}}\n"
+    )
+    result = run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap")
+    assert result.error is None
+    notes = [note for note in result.notes if "was killed by SIGSEGV when the run was over" in note]
+    assert len(notes) == 1
+    assert " at robot.cpp:16 in crash(" in notes[0]

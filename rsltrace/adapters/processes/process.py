@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import struct
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -64,6 +65,7 @@ _PUBLISH, _WAIT = int(RecordKind.PUBLISH), int(RecordKind.WAIT)
 _head, _number = RECORD.unpack_from, HEAD.unpack_from
 _NOT_A_BATCH = (WireError, LookupError, ValueError, TypeError, AttributeError, struct.error)
 """What reading raises if something else than the library has written to the link."""
+_CRASHES = (signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV)
 _WROTE = "wrote something of its own to"
 
 Question = Callable[[RecordReader], bytes]
@@ -378,7 +380,11 @@ class Process:
         self.ended = ProcessEnd(ended.status, broken_link or ended.broken_link)
         self.vanish()
         self.adapter.has_ended(self)
+        where = f" at {self._crashed_at[0]}" if self._crashed_at else ""
         if self._is_stopping:
+            if -ended.status in _CRASHES:  # a destructor, after SIGINT
+                note = f"process {self.name} {ended.said} when the run was over{where}"
+                self.adapter.domain.outcome.notes.append(note)
             return
         at = format_seconds(self.dispatcher.loop.now_ns)  # of ROS: the text is hashed
         if not self.ended.failed:
@@ -389,9 +395,8 @@ class Process:
         text = f"{happened}; the last that it ran was {last}"
         if self.log_failure:
             self.adapter.log(40, self.name, text)
-            if self._crashed_at:
-                note = f"process {self.name} crashed at {self._crashed_at[0]}"
-                self.adapter.domain.outcome.notes.append(note)
+            if where:
+                self.adapter.domain.outcome.notes.append(f"process {self.name} crashed{where}")
         else:
             raise NodeError(
                 text,
