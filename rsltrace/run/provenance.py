@@ -208,7 +208,8 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 def source_files(job: Job) -> dict[str, Path]:
     """Return the files of ``loaded_modules``, and the job's scripts, programs, executables,
-    parameter files of command lines and model files (``file:`` and what the job calls them)."""
+    libraries of components, parameter files of command lines and model files (``file:`` and what
+    the job calls them)."""
     modules = loaded_modules(job)
     modules.update(_run_as_main(job))
     modules.update(_parameter_files(job))
@@ -304,10 +305,26 @@ def _run_as_main(job: Job) -> Iterator[tuple[str, Path]]:
                 yield f"file:{spec.executable}", found_file
         elif file is not None:
             yield f"file:{file}", job.resolve(file)
+        elif spec.component is not None:
+            if (library := _library_of(spec.component)) is not None:
+                yield f"file:{library.name}", library
         elif spec.module is not None:
             found = run_as_main(spec.module)
             if found is not None and is_below(found.origin or "", folders):
                 yield found.name, Path(found.origin or "")
+
+
+def _library_of(component: str) -> Path | None:
+    """Return the library that a container loads for a component, as ament's index has it."""
+    package, _, plugin = component.partition("/")
+    for prefix in installed_prefixes():
+        with suppress(OSError):
+            index = prefix / "share/ament_index/resource_index/rclcpp_components" / package
+            for line in index.read_text(errors="replace").splitlines():
+                name, _, library = line.partition(";")
+                if name == plugin:
+                    return prefix / library
+    return None
 
 
 def _parameter_files(job: Job) -> Iterator[tuple[str, Path]]:

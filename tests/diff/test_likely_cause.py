@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.diff.causes.calls import call_difference
+from rsltrace.diff.causes.calls import _paired, call_difference
 from rsltrace.diff.causes.likely_cause import telling_calls
 from rsltrace.diff.facts.causes import ExternalAnswers
 from rsltrace.diff.facts.evidence import (
@@ -16,6 +16,8 @@ from rsltrace.diff.facts.evidence import (
     Presence,
 )
 from rsltrace.diff.sentences import sentence
+from rsltrace.diff.sentences.divergence import call_text
+from rsltrace.trace.model.finding import Finding, GuardMode, NondeterminismSource
 from rsltrace.trace.words.entities import EntityKey
 
 PLACE = "picker.py:24 in Picker.pick"
@@ -86,3 +88,28 @@ def test_of_several_answers_those_that_show_are_told() -> None:
 
 def message(topic: str, presence: Presence, **more: Any) -> MessageDifference:
     return MessageDifference(None, topic, "", 0, presence, None, None, **more)
+
+
+def test_calls_are_the_same_though_an_edit_has_moved_their_lines() -> None:
+    def finding(call: str, value: str, stack: str) -> Finding:
+        source, mode = NondeterminismSource.CLOCK, GuardMode.RECORD
+        return Finding(3, 7, "/picker", source, mode, call, value, stack)
+
+    a = [finding("now()", "1", f"picker.cpp:{line} in tick()") for line in (10, 12)]
+    b = [finding("now()", "1", f"picker.cpp:{line} in tick()") for line in (11, 12, 13)]
+    b += [finding("now()", "2", "picker+0x10"), finding("rand()", "4", "picker.cpp:11 in tick()")]
+    pairs = [
+        (found.call, found.a, found.b)
+        for found in _paired([*a, finding("now()", "2", "picker+0x8")], b)
+    ]
+    assert sorted(pairs, key=str) == [
+        ("now()", "1", "1"),
+        ("now()", "1", "1"),
+        ("now()", "2", "2"),
+        ("now()", None, "1"),
+        ("rand()", None, "4"),
+    ]
+
+
+def test_a_call_without_a_line_is_said_without_one() -> None:
+    assert call_text(call("clock", "now()", None, "2", where="")) == "read now() only in b"

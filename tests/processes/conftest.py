@@ -45,7 +45,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
         if not target.exists():
             include = [f"-I{path}" for path in ros.include]
             link = [f"-l{library}" for library in _LIBRARIES]
-            words = ["-Wall", "-Wextra", "-Werror", "-O1", "-x", "c", str(SOURCES / name)]
+            words = ["-Wall", "-Wextra", "-Werror", "-O1", "-g", "-x", "c", str(SOURCES / name)]
             words += ["-x", "none", "-o", str(target), *include, f"-L{ros.prefix / 'lib'}", *link]
             words.append("-Wl,--unresolved-symbols=ignore-in-shared-libs")
             subprocess.run([*compiler, *words], check=True)

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from rsltrace.errors import JobError, RunError
-from rsltrace.job import load_job
+from rsltrace.job import job_from_text, load_job
 from rsltrace.run import RunResult, run
+from rsltrace.run.provenance import source_files
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros
@@ -140,3 +141,17 @@ def test_without_the_interface_the_error_says_what_to_install(
     (folder / "job.yaml").write_text(JOB.format(second="Second", on_exception="stop"))
     with pytest.raises(JobError, match=r"job\.yaml:4:16: composition_interfaces/srv/LoadNode"):
         run(load_job(folder / "job.yaml"), None)
+
+
+def test_the_library_of_a_component_is_part_of_the_code_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    index = tmp_path / "share/ament_index/resource_index/rclcpp_components"
+    index.mkdir(parents=True)
+    (index / "robot").write_text("robot::Eye;lib/libeye.so\nrobot::Arm;lib/libarm.so\n")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path / 'none'}:{tmp_path}")
+    entries = [f"{{component: 'robot/robot::{name}', container: /c}}" for name in ("Arm", "Lost")]
+    text = f"nodes: [{{program: /bin/true, name: c}}, {', '.join(entries)}]"
+    job = job_from_text(text, "job.yaml", tmp_path)
+    found = {name: path for name, path in source_files(job).items() if name.startswith("file:lib")}
+    assert found == {"file:libarm.so": tmp_path / "lib/libarm.so"}

@@ -11,6 +11,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.job import load_job
 from rsltrace.run import run
+from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros
@@ -24,5 +25,11 @@ def test_callbacks_for_what_arrives_are_called_once_for_each_arrival(
     assert result.error is None
     with Trace.open(tmp_path / "t.mcap") as trace:
         told = [trace.decode("/told", data).data for _, _, data in trace.messages("/told")]  # type: ignore[attr-defined]
+        client = next(e for e in trace.entities.values() if e.kind is EntityKind.CLIENT)
+        lines = [line.place.rpartition("/")[2] for line in trace.code_lines[client.id]]
+    calls = (Path(__file__).parent / "listener.c").read_text().splitlines()
+    assert lines == [
+        f"listener.c:{number}" for number, line in enumerate(calls, 1) if "rcl_send_request" in line
+    ]
     assert told == [1, 0, 1, 0, 3, 2, 2, 2, 1, 1]
     assert any("/listener: service /ask 4 (depth 2)" in note for note in result.notes)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from rsltrace.adapters.processes import graph_answers
@@ -64,9 +65,21 @@ _PUBLISH, _WAIT = int(RecordKind.PUBLISH), int(RecordKind.WAIT)
 _head, _number = RECORD.unpack_from, HEAD.unpack_from
 _NOT_A_BATCH = (WireError, LookupError, ValueError, TypeError, AttributeError, struct.error)
 """What reading raises if something else than the library has written to the link."""
+_CRASHES = (signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV)
 _WROTE = "wrote something of its own to"
 
 Question = Callable[[RecordReader], bytes]
+
+
+def _as_traceback(stack: Sequence[str]) -> str:
+    """Return lines of a C++ stack as Python prints its own."""
+    lines = ["Traceback (most recent call last):\n"] if stack else []
+    for one in reversed(stack):
+        place, _, function = one.partition(" in ")
+        file, _, number = place.rpartition(":")
+        line = f'"{file}", line {number}, in {function}' if function else f'"{place}"'
+        lines.append(f"  File {line}\n")
+    return "".join(lines)
 
 
 class ProcessRun(EntityFactory, Protocol):
@@ -130,6 +143,8 @@ class Process:
         self._waking_soon = False
         self._last: WaitableEntity | None = None
         self._is_stopping = False
+        self._crashed_at: list[str] = []
+        """The lines of its own code, innermost first."""
         self._graph = GraphChange(self)
         adapter.domain.graph.changed.append(self._graph.note)
         self._questions: dict[int, Question] = {
@@ -159,6 +174,7 @@ class Process:
             RecordKind.ALIVE: self._alive,
             RecordKind.UNSEEN: self._unseen,
             RecordKind.DRAW: self._draw,
+            RecordKind.CRASH: self._crash,
             RecordKind.DROPPED: lambda fields: self.things[fields.number()].drop(),
         }
 
@@ -364,7 +380,11 @@ class Process:
         self.ended = ProcessEnd(ended.status, broken_link or ended.broken_link)
         self.vanish()
         self.adapter.has_ended(self)
+        where = f" at {self._crashed_at[0]}" if self._crashed_at else ""
         if self._is_stopping:
+            if -ended.status in _CRASHES:  # a destructor, after SIGINT
+                note = f"process {self.name} {ended.said} when the run was over{where}"
+                self.adapter.domain.outcome.notes.append(note)
             return
         at = format_seconds(self.dispatcher.loop.now_ns)  # of ROS: the text is hashed
         if not self.ended.failed:
@@ -375,9 +395,16 @@ class Process:
         text = f"{happened}; the last that it ran was {last}"
         if self.log_failure:
             self.adapter.log(40, self.name, text)
+            if where:
+                self.adapter.domain.outcome.notes.append(f"process {self.name} crashed{where}")
         else:
-            now_ns = self.dispatcher.loop.now_ns
-            raise NodeError(text, node="", entity=self.name, stamp_ns=now_ns, traceback_text="")
+            raise NodeError(
+                text,
+                node="",
+                entity=self.name,
+                stamp_ns=self.dispatcher.loop.now_ns,
+                traceback_text=_as_traceback(self._crashed_at),
+            )
 
     def stop(self) -> None:
         """Tell it as whoever starts nodes does that the run is over (Ctrl-C), and end it once it
@@ -501,6 +528,9 @@ class Process:
         running = self._running_node()
         node = running.key if running is not None else ""
         self.adapter.note_answer(source, call, answer, stack_text(fields.rest()), node, calls)
+
+    def _crash(self, fields: RecordReader) -> None:
+        self._crashed_at = stack_text(fields.rest()).splitlines()
 
     def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()

@@ -321,7 +321,7 @@ class ProcessEntities(dict[int, Any]):
     def _sender(self, fields: RecordReader) -> None:
         """Record the line of code that is about to send by an endpoint, once for each callback."""
         end, dispatcher = self[fields.number()], self._process.dispatcher
-        if end.topic in _OF_NODES or dispatcher.recorder is None:
+        if end.trace_name() in _OF_NODES or dispatcher.recorder is None:
             return  # rcl and rclcpp send there
         stack = stack_text(fields.rest())
         place, _, function = stack.partition("\n")[0].partition(" in ")

@@ -33,14 +33,14 @@ def _has_lines(module: str) -> bool:
 @lru_cache(maxsize=4096)
 def stack_text(packed: bytes) -> str:
     """Return the lines of the program's own code (``node.cpp:24 in Node::tick()``), innermost
-    first, one per line of text; where there is no debug information, the innermost address, as
-    addr2line takes it. ``packed`` is a stack as the process sends it.
+    first, one per line of text, none of a template of ROS; where there is no debug information, the
+    innermost address, as addr2line takes it. ``packed`` is a stack as the process sends it.
 
     :raises WireError: if it is none.
     """
     frames = list(RecordReader(packed).frames())
     lines = _lines_of(frames)
-    if lines or not frames:
+    if lines or not frames or _has_lines(frames[0][0]):
         return "\n".join(lines)
     module, address = frames[0]
     return f"{Path(module).name}+{address:#x}"

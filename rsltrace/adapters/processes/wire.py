@@ -67,6 +67,7 @@ class RecordKind(IntEnum):
     UNSEEN = 32
     DRAW = 33
     SENDER = 34
+    CRASH = 35
 
 
 class CommandKind(IntEnum):

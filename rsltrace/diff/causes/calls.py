@@ -11,7 +11,7 @@ import json
 import os
 import re
 from itertools import zip_longest
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any
 
 from rsltrace.diff.alignment.rows import ComparedTrace
@@ -145,21 +145,30 @@ def _files_of(run: ComparedTrace, view: EventSummary, node: str) -> frozenset[st
 
 
 def _paired(a: list[Finding], b: list[Finding]) -> list[CallDifference]:
-    """Pair the n-th findings of each call at each place; a file may lie in another folder.
+    """Pair the n-th findings of each call at each place, then those in the same functions: an edit
+    moves lines. A file may lie in another folder.
 
     They come in the order in which they were made, in whichever run that was first.
     """
-    places: dict[tuple[str, str], tuple[list[_Numbered], list[_Numbered]]] = {}
-    for side, findings in enumerate((a, b)):
-        for number, finding in enumerate(findings):
-            place = (re.sub(_FOLDER, r"\1", finding.call), finding.stack)
-            places.setdefault(place, ([], []))[side].append((finding.event, number, finding))
     calls = []
-    for place, (of_a, of_b) in places.items():
-        for x, y in zip_longest(of_a, of_b):
-            made = min(one[:2] for one in (x, y) if one is not None)
-            calls.append((made, place, _difference(x and x[2], y and y[2])))
+    rest = [[(one.event, number, one) for number, one in enumerate(found)] for found in (a, b)]
+    for place_of in (attrgetter("stack"), _functions):
+        places: dict[tuple[str, str], tuple[list[_Numbered], list[_Numbered]]] = {}
+        for side, found in enumerate(rest):
+            for one in found:
+                place = (re.sub(_FOLDER, r"\1", one[2].call), place_of(one[2]))
+                places.setdefault(place, ([], []))[side].append(one)
+        pairs = [(at, *pair) for at, sides in places.items() for pair in zip_longest(*sides)]
+        rest = [[x for _, x, y in pairs if x and not y], [y for _, x, y in pairs if y and not x]]
+        for place, x, y in pairs:
+            if (x and y) or place_of is _functions:
+                made = min(one[:2] for one in (x, y) if one is not None)
+                calls.append((made, place, _difference(x and x[2], y and y[2])))
     return [call for *_, call in sorted(calls, key=itemgetter(0, 1))]
+
+
+def _functions(finding: Finding) -> str:
+    return "\n".join(line.partition(" in ")[2] for line in finding.stack.splitlines())
 
 
 def _difference(a: Finding | None, b: Finding | None) -> CallDifference:

@@ -169,7 +169,8 @@ def _calls(found: Divergence, width: int) -> Section:
                 rows.append(cut(line("  ", mark, what), width))
                 for name, style, value in (("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)):
                     rows.append(cut(line("      ", (f"{name} ", style), value), width))
-        rows.append(cut(line((f"      at {printable(call.where)}", Style.FAINT)), width))
+        if call.where:
+            rows.append(cut(line((f"      at {printable(call.where)}", Style.FAINT)), width))
     if len(rows) == 2:  # one call on one line, and its place
         differs = " that differs" * found.calls[0].differs
         rows[0] = cut(line((f"external call{differs}: ", Style.TITLE), *rows[0][1:]), width)

@@ -640,9 +640,10 @@ def call_text(call: CallDifference) -> str:
     """Return ``read MOTOR_SEED (6 in a, 4 in b) at picker.py:24``."""
     done = f"{_CALLED.get(NondeterminismSource(call.source), 'called')} {printable(call.subject)}"
     place = call.where.partition(" in ")[0]
+    at = f" at {place}" if place else ""
     if call.a is None or call.b is None:
-        return f"{done} only in {'b' if call.a is None else 'a'} at {place}"
-    return f"{done} ({call.short[0]} in a, {call.short[1]} in b) at {place}"
+        return f"{done} only in {'b' if call.a is None else 'a'}{at}"
+    return f"{done} ({call.short[0]} in a, {call.short[1]} in b){at}"
 
 
 @says(ErrorInTransition)

@@ -33,7 +33,8 @@ constexpr std::uint32_t SENDERS_FIRST = 32;     // as adapters/rclpy/concurrency
 
 const char *const LIBRARIES[] = {"librcl.so", "librclcpp.so", "libc.so.6", "libstdc++.so.6"};
 
-// In no memory of the heap: how long paths are must not show in the program's addresses.
+}  // namespace
+
 bool is_library(const Dl_info &info) {
   Dl_info here{};
   if (dladdr(reinterpret_cast<const void *>(&note_sender), &here) != 0 && here.dli_fbase == info.dli_fbase) return true;
@@ -48,6 +49,8 @@ bool is_library(const Dl_info &info) {
   }
   return false;
 }
+
+namespace {
 
 // The path of a file that may be unloaded. Not in the heap either; "" if there are too many.
 const char *kept(const char *path) {

@@ -1,6 +1,8 @@
 // The lines of the program's own code that draw, look at clocks and publish: addresses here, lines there.
 #pragma once
 
+#include <dlfcn.h>
+
 #include <cstdint>
 #include <string>
 
@@ -11,6 +13,9 @@ namespace rsltrace {
 // The numbers are those of ../process.py.
 enum class Source : std::uint32_t { RANDOM = 0, CLOCK = 1, PID = 2, VARIABLE = 3 };
 
+// Whether a file is none of the program's own: ROS's, libc's or the C++ library's. Takes no memory of
+// the heap: how long paths are must not show in the program's addresses.
+bool is_library(const Dl_info &info);
 // Whether a call comes from the program's own code: none of ROS, libc or the C++ library.
 bool is_own_code(const void *caller);
 // Put into the trace what the program's own code got from a call. `where` is where it returns to.

@@ -214,19 +214,19 @@ std::uint64_t times_let_go() { return lets_go; }
 
 std::uint32_t last_ready() { return ready_id; }
 
-void say(Say kind, const Writer &body) {
+void say(Say kind, const void *body, std::size_t size) {
   if (!linked()) return;
-  const std::uint32_t head[2] = {static_cast<std::uint32_t>(kind),
-                                 static_cast<std::uint32_t>(body.bytes.size())};
+  const std::uint32_t head[2] = {static_cast<std::uint32_t>(kind), static_cast<std::uint32_t>(size)};
   const std::size_t start = LENGTH + length_said().load(std::memory_order_relaxed);
   if (start > said.size) lost();  // the program has written over it
-  const std::size_t end = start + sizeof head + body.bytes.size();
+  const std::size_t end = start + sizeof head + size;
   if (end > said.size && !said.grow(2 * end)) lost();
   std::memcpy(said.data + start, head, sizeof head);
-  if (!body.bytes.empty())
-    std::memcpy(said.data + start + sizeof head, body.bytes.data(), body.bytes.size());
+  if (size > 0) std::memcpy(said.data + start + sizeof head, body, size);
   length_said().store(end - LENGTH, std::memory_order_release);  // not before it is whole
 }
+
+void say(Say kind, const Writer &body) { say(kind, body.bytes.data(), body.bytes.size()); }
 
 std::vector<std::uint8_t> ask(Say kind, const Writer &body) {
   const Asking asking;

@@ -63,6 +63,7 @@ std::uint64_t seed();
 
 // Append a record to the batch that the loop takes with the next wait or question, or if the process
 // ends.
+void say(Say kind, const void *body, std::size_t size);
 void say(Say kind, const Writer &body);
 // Send the batch with a question at its end, and return the answer.
 std::vector<std::uint8_t> ask(Say kind, const Writer &body);

@@ -1,6 +1,7 @@
 // Services and clients: requests and responses, with the number of the request and who asked.
 #include <rmw/get_service_names_and_types.h>
 
+#include "call_sites.h"
 #include "listeners.h"
 #include "rmw_common.h"
 
@@ -103,6 +104,7 @@ RSLTRACE_EXPORT rmw_ret_t rmw_send_request(const rmw_client_t *client, const voi
   Endpoint &from = endpoint(client);
   if (!from.type.serialize(request, data)) return RMW_RET_ERROR;
   *sequence_id = ++from.requests;  // the loop counts them in the same way
+  note_sender(from.id);
   Writer body;
   body.number(from.id);
   body.raw(data.data(), data.size());

@@ -47,6 +47,7 @@ enum class Say : std::uint32_t {
   UNSEEN,
   DRAW,
   SENDER,
+  CRASH,
 };
 
 // From the loop to the library, in other memory that both see: what comes after (length, kind).

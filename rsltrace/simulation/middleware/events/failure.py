@@ -137,6 +137,8 @@ def is_own_frame(frame: FrameType) -> bool:
 
 def user_traceback(error: BaseException) -> str:
     """Return the traceback without rsltrace's frames, if others remain."""
+    if isinstance(error, NodeError) and error.traceback_text:  # of a process
+        return f"{error.traceback_text}{type(error).__qualname__}: {error}\n"
     with contextlib.suppress(Exception):
         left_out = sum(map(_shorten, (error, error.__cause__, error.__context__)))
         summary = traceback.TracebackException(
