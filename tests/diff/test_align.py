@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rsltrace.diff.alignment.align import NO_CAUSE, UNKNOWN, EarlierPairs, EventSequence, match
@@ -47,6 +47,11 @@ rows = st.lists(
 
 
 @given(rows, rows, st.booleans())
+@example(
+    [(10, 0, NO_CAUSE, 0), (10, 0, NO_CAUSE, 0), (10, 1, NO_CAUSE, 0)],
+    [(10, 2, NO_CAUSE, 0), (10, 1, NO_CAUSE, 0), (10, 0, NO_CAUSE, 0)],
+    False,
+)
 def test_pairs_are_one_to_one_and_symmetric(a: list[Row], b: list[Row], surest: bool) -> None:
     there = pairs(a, b, surest_only=surest)
     back = pairs(b, a, surest_only=surest)

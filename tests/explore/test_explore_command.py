@@ -92,9 +92,7 @@ def test_a_search_that_is_killed_goes_on_where_it_was(
     words = [sys.executable, "-m", "rsltrace", *words]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
     table = folder / "results.jsonl"
-    while not table.exists() or table.read_bytes().count(b"\n") < 6:
-        assert process.poll() is None
-        time.sleep(0.02)
+    _wait_for_rows(table, process)
     process.send_signal(signal.SIGKILL)
     process.wait()
     before = table.read_bytes()
@@ -108,6 +106,14 @@ def test_a_search_that_is_killed_goes_on_where_it_was(
     assert sorted(numbers) == list(range(24))
 
 
+def _wait_for_rows(table: Path, process: subprocess.Popen[Any]) -> None:
+    ended = False
+    while not table.exists() or table.read_bytes().count(b"\n") < 6:
+        assert not ended
+        time.sleep(0.02)
+        ended = process.poll() is not None  # before one looks: what it wrote at last counts
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_search_that_is_ended_says_what_it_found(
@@ -118,10 +124,7 @@ def test_a_search_that_is_ended_says_what_it_found(
     command = [sys.executable, "-m", "rsltrace", *words]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
-        table = folder / "results.jsonl"
-        while not table.exists() or table.read_bytes().count(b"\n") < 6:
-            assert process.poll() is None
-            time.sleep(0.02)
+        _wait_for_rows(folder / "results.jsonl", process)
         process.send_signal(number)
         found, told = process.communicate(timeout=600)
     assert process.returncode == 128 + number

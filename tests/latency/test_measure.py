@@ -308,6 +308,7 @@ def through(message: Sent, topics: list[str], via: str) -> Iterator[list[Sent]]:
 @settings(max_examples=RUNS, deadline=None)
 @given(seed=st.integers(0, 10**9))
 @example(seed=439)  # a node that samples has received a newer message, which came of no input
+@example(seed=365893)  # a callback goes on with a message that came of no input, after a newer one
 def test_a_chain_through_a_node_that_samples(seed: int) -> None:
     run, messages, taken = random_run(seed)
     chance = random.Random(seed)

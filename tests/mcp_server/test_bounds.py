@@ -241,6 +241,11 @@ def until(what: Callable[[], bool]) -> None:
     raise AssertionError("it did not happen")
 
 
+def has_begun(pids: Path) -> bool:
+    """Return whether a process that runs nodes has written down its number."""
+    return pids.exists() and pids.read_text().endswith("\n")
+
+
 def is_over(pids: Path) -> bool:
     """Return whether the processes that have run nodes are gone."""
     return not any(map(has_command, pids.read_text().split()))
@@ -317,7 +322,7 @@ def test_no_simulation_outlives_the_client(
     process = server(endless.parent)
     with process:
         begin(process, tool, **arguments)
-        until(endless.exists)
+        until(lambda: has_begun(endless))
         if how == "stdin":
             assert process.stdin is not None
             process.stdin.close()
@@ -347,7 +352,7 @@ def test_no_session_outlives_the_client(how: str, endless: Path) -> None:
     process = server(folder, "--limit", "1000")
     with process:
         begin(process, "run_until", trace="run.mcap", condition="when endless.x == 1")
-        until(endless.exists)
+        until(lambda: has_begun(endless))
         assert process.stdin is not None
         if how == "stdin":
             process.stdin.close()

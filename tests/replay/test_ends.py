@@ -127,7 +127,7 @@ def test_a_replay_that_is_interrupted(recorded: Callable[..., Path], tmp_path: P
         "nodes: [{node: nodes_of_replay:Slow}]\nstop: {events: 3000}\n",
         "class Slow(Source):\n    def tick(self):\n        super().tick()\n"
         "        if self.count == 9: self.get_logger().info('it runs')\n"
-        "        if os.path.exists('slow'): sum(range(300_000))\n",
+        "        while self.count == 9 and os.path.exists('slow'): pass\n",
     )
     (tmp_path / "slow").touch()
     command = [sys.executable, "-m", "rsltrace", "replay", "run.mcap"]
@@ -138,6 +138,7 @@ def test_a_replay_that_is_interrupted(recorded: Callable[..., Path], tmp_path: P
     assert "replaying run.mcap" in process.stderr.readline()
     assert any("it runs" in line for line in iter(process.stderr.readline, ""))
     process.send_signal(signal.SIGINT)
+    (tmp_path / "slow").unlink()  # not before: it would be over if we were late
     out, _ = process.communicate(timeout=600)
     assert process.returncode == 130, out
     assert out.startswith("verified the first ")

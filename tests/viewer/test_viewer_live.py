@@ -89,8 +89,8 @@ class Live:
 
     async def answer(self, key: str, text: str) -> None:
         """Press a key that asks, and answer."""
-        await self.pilot.press(key)
-        await self.pilot.pause()
+        await self.press(key)
+        assert self.app.prompt.asking
         self.app.prompt.query_one("#answer").value = text
         await self.press("enter")
 

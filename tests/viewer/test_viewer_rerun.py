@@ -60,16 +60,23 @@ def below(pid: int) -> list[int]:
 class Shown:
     """An app with a follower, and what it has said."""
 
-    def __init__(self, app: ViewerApp, pilot: Any, folder: Path) -> None:
+    def __init__(self, app: ViewerApp, pilot: Any, folder: Path, heard: list[str]) -> None:
         self.app = app
         self.pilot = pilot
         self.folder = folder
+        self.heard = heard
+        """All that the follower has said: what comes next may be on the screen before one looks."""
 
     async def press(self, *keys: str) -> None:
         """Press keys."""
         for key in keys:
             await self.pilot.press(key)
         await settle(self.app, self.pilot.pause)
+
+    async def hears(self, text: str) -> None:
+        """Wait until the follower has said a text."""
+        while not any(text in one for one in self.heard):
+            await self.pilot.pause(0.05)
 
     async def says(self, text: str) -> str:
         """Wait for a text on the screen."""
@@ -93,12 +100,19 @@ def follow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
         program.chmod(0o755)
         monkeypatch.setenv("RERUN_CLI_PATH", str(program))
         session, follower = open_session(*traces), RerunFollower(traces)
+        heard: list[str] = []
+        start = follower.start
+
+        def listen(say: Callable[[str, bool], None]) -> None:
+            start(lambda text, is_over: (heard.append(text), say(text, is_over))[1])
+
+        monkeypatch.setattr(follower, "start", listen)
 
         async def run_app() -> None:
             app = ViewerApp(session, rerun=follower)
             async with app.run_test(size=(160, 40), notifications=True) as pilot:
                 await settle(app, pilot.pause)
-                await steps(Shown(app, pilot, tmp_path))
+                await steps(Shown(app, pilot, tmp_path, heard))
 
         try:
             asyncio.run(run_app())
@@ -127,7 +141,7 @@ def test_a_viewer_that_does_not_start(follow: Any, made: Path) -> None:
 @pytest.mark.long
 def test_one_leaves_before_anything_is_there(follow: Any, long: Path) -> None:
     async def steps(shown: Shown) -> None:
-        await shown.says("making a recording")
+        await shown.hears("making a recording")
 
     follow("exit 1", steps, long)
 

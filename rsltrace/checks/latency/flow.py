@@ -246,7 +246,7 @@ class MessageFlow:
                 left_ns = stamp_ns + busy_ns
                 if self._observed is not None:
                     left_ns = self._observed.left_ns(index, place, stamp_ns)
-                row = self._publish(key, sender, stamp_ns, left_ns, taken)
+                row = self._publish(key, sender, stamp_ns, left_ns, taken, entity)
                 follows = place
                 continue
             draw, value_ns = number >> _KIND_BITS, number & _VALUE
@@ -321,15 +321,20 @@ class MessageFlow:
             at += 1
         return NONE
 
-    def _publish(self, key: int, sender: int, began_ns: int, left_ns: int, taken: int) -> int:
-        """Add a message, for each path that it came on; return its first row, if it has one."""
+    def _publish(
+        self, key: int, sender: int, began_ns: int, left_ns: int, taken: int, called: int
+    ) -> int:
+        """Add a message, for each path that it came on; return its first row, if it has one.
+
+        ``called`` is the entity of the event that published it.
+        """
         paths, hop, add = self.paths, self._hops[sender], self.messages.add
         first = self.messages.count
         if paths.begins(hop):
             add(key, paths.begun(hop), NONE, NONE, began_ns, left_ns)
         came = False
         of_paths, rows = self.messages["path"], self.taken["rows"]
-        for one in self._inputs(sender, taken):
+        for one in self._inputs(sender, taken, called):
             came = True
             parent = self.taken["message"][one]
             for row in range(parent, parent + rows[one]):
@@ -345,11 +350,15 @@ class MessageFlow:
             )
         return first if self.messages.count > first else NONE
 
-    def _inputs(self, sender: int, taken: int) -> Iterator[int]:
+    def _inputs(self, sender: int, taken: int, called: int) -> Iterator[int]:
         """Yield how the messages were received that a message comes of."""
         if taken != NONE:
             yield taken
         received = self._last.get(self.node_of(sender)) if self._last else None
         if received:
-            own = "" if taken == NONE else self._topic(self.taken["message"][taken])
-            yield from (one for topic, one in received.items() if topic != own and one != NONE)
+            if taken != NONE:
+                own = self._topic(self.taken["message"][taken])
+            else:  # it may go on with a message that came of no input: not of a newer one, then
+                one = self.trace.entities.get(called)
+                own = one.name if one and one.kind is EntityKind.SUBSCRIPTION else ""
+            yield from (took for topic, took in received.items() if topic != own and took != NONE)

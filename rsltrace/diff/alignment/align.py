@@ -73,7 +73,9 @@ class EventSequence:
 
 
 def match(a: EventSequence, b: EventSequence, *, surest_only: bool) -> list[Pair]:
-    """Return pairs of positions: which event of ``a`` is which of ``b``."""
+    """Return pairs of positions: which event of ``a`` is which of ``b``, whichever comes first."""
+    if b.columns < a.columns:  # what is taken in passing depends on the order of the two
+        return [(i, j) for j, i in match(b, a, surest_only=surest_only)]
     begin, end = _same_ends(a, b)
     pairs = [(position, position) for position in range(begin)]
     shift = len(b) - len(a)
