@@ -257,14 +257,6 @@ class CauseKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class ParameterFiles(Fact):
-    """Parameters differ that a parameter file may give: its content is not in the trace."""
-
-    parameters: tuple[str, ...]
-    files: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class WaitInOneRun(Fact):
     """A callback that waited, in one run only, for what ``cause`` sent."""
 
@@ -321,7 +313,6 @@ class SameCause(Fact):
 
 CauseFact = (
     CauseKind
-    | ParameterFiles
     | WaitInOneRun
     | NotDelivered
     | DifferentSenders

@@ -26,7 +26,6 @@ from rsltrace.diff.facts.causes import (
     NoEventsLeft,
     NoMoreMessages,
     NotDelivered,
-    ParameterFiles,
     QueueOverflow,
     RunEnd,
     SameCause,
@@ -679,13 +678,6 @@ SENTENCES.update(
         ),
         CauseKind.FAULT_IN_ONE: lambda fact, of: (
             because_of(of.settings) or f"only the job of {_has(of)[0]} has this fault"
-        ),
-        ParameterFiles: lambda fact, of: (
-            because_of(of.settings)
-            or (
-                f"parameter {listed(fact.parameters)}: a parameter file ({listed(fact.files)}) or "
-                "the constructor sets a different value"
-            )
         ),
         DifferentSenders: lambda fact, of: (
             f"in a it came from {phrase(fact.a)} (event {fact.a.index}), in b from "
