@@ -9,6 +9,7 @@ import math
 import os
 import platform
 import sys
+import time
 import warnings
 import zlib
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
@@ -167,7 +168,9 @@ def module_code(modules: Mapping[str, Path], late: Container[str] = ()) -> dict[
         except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
             continue
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        imports = sorted({*_imported(tree, package)} & {*modules} - {name})
+        begins = tuple(_named_later(tree))
+        later = {one for one in modules if ":" not in one and one.startswith(begins)}
+        imports = sorted(({*_imported(tree, package)} & {*modules} | later) - {name})
         digest = _hash(ast.dump(tree).encode("utf-8", "surrogatepass"))
         code: dict[str, object] = {"hash": digest, "imports": imports}
         found[name] = json.dumps(code | ({"late": True} if name in late else {}))
@@ -190,6 +193,20 @@ def _without_comments(path: Path) -> str | None:
     return None
 
 
+def _named_later(tree: ast.Module) -> Iterator[str]:
+    """Yield how the names begin that ``import_module`` and the like are called with: "" if that is
+    not known."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and node.args:
+            called = getattr(node.func, "attr", None) or getattr(node.func, "id", "")
+            first: ast.AST = node.args[0]
+            while isinstance(first, ast.BinOp | ast.JoinedStr):
+                first = first.left if isinstance(first, ast.BinOp) else (first.values or [node])[0]
+            if called in _IMPORTERS:
+                text = str(first.value) if isinstance(first, ast.Constant) else ""
+                yield "" if text.startswith(".") else text
+
+
 def _imported(tree: ast.Module, package: str) -> Iterator[str]:
     """Yield the modules that may be imported, with their parent packages."""
     for node in ast.walk(tree):
@@ -205,6 +222,7 @@ def _imported(tree: ast.Module, package: str) -> Iterator[str]:
             yield from (".".join(parts[:count]) for count in range(1, len(parts) + 1))
 
 
+_IMPORTERS = ("import_module", "__import__")
 _YAML = (".yaml", ".yml")
 _DEFINITIONS = (".msg", ".srv", ".action")
 _PACKAGES = ("rclpy", "numpy", "scipy", "rosbags", "mcap", "xxhash")
@@ -237,10 +255,10 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 def source_files(job: Job) -> dict[str, Path]:
     """Return the files of ``loaded_modules``, and the job's scripts, programs, executables,
-    parameter files and model files (``file:`` and what the job calls them)."""
+    files of parameters, terminal input and models (``file:`` and what the job calls them)."""
     modules = loaded_modules(job)
     modules.update(_run_as_main(job))
-    modules.update(_parameter_files(job))
+    modules.update(_input_files(job))
     modules.update(_interface_files())
     modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
     return modules
@@ -358,8 +376,9 @@ def _run_as_main(job: Job) -> Iterator[tuple[str, Path]]:
                 yield found.name, Path(found.origin or "")
 
 
-def _parameter_files(job: Job) -> Iterator[tuple[str, Path]]:
+def _input_files(job: Job) -> Iterator[tuple[str, Path]]:
     paths = [path for spec in job.nodes for path in spec.parameter_files]
+    paths += [one.file for spec in job.nodes for one in spec.stdin or () if one.file is not None]
     for words in (job.ros_arguments, *(spec.arguments for spec in job.nodes)):
         paths += [path for flag, path in pairwise(words) if flag == "--params-file"]
     for path in paths:
@@ -439,6 +458,8 @@ def environment(job: Job | None = None) -> dict[str, str]:
     }
     if options := _python_options():
         values["python_options"] = options
+    if (zone := "/".join(dict.fromkeys(time.tzname))) != "UTC":  # of runs that are not pinned
+        values["time_zone"] = zone
     values.update(_versions())
     kernels = "" if job is None else numerical_libraries(job)
     if kernels:

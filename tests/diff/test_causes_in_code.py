@@ -328,3 +328,36 @@ def test_a_main_that_spins_until_the_run_ends_does_not_sleep(
         assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
     sentence = diff_files("a.mcap", "b.mcap").sentence
     assert "slept 100 ms in a but not in b" in sentence, sentence
+
+
+_TYPED = """
+import rclpy
+from std_msgs.msg import String
+def main():
+    rclpy.init()
+    out = rclpy.create_node("typed").create_publisher(String, "typed", 10)
+    out.publish(String(data=input()))
+"""
+
+
+def test_of_what_is_typed(tmp_path: Path, command: Callable[..., Any]) -> None:
+    (tmp_path / "typed.py").write_text(_TYPED)
+    (tmp_path / "job.yaml").write_text("nodes: [{main: 'typed:main', stdin: typed.txt}]\n")
+    for name in ("a", "b"):
+        (tmp_path / "typed.txt").write_text(f"{name}\n")
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    assert cause("a.mcap", "b.mcap") == ["file typed.txt"]
+
+
+def test_what_the_c_library_answers_is_a_possible_cause(
+    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = "import ctypes\nread = ctypes.CDLL(None).getenv\nread.restype = ctypes.c_char_p\n"
+    (tmp_path / "tuned.py").write_text(node + _TUNED.replace("BIAS", "len(read(b'FAULT'))"))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for name, value in (("a", "1"), ("b", "12")):
+        monkeypatch.setenv("FAULT", value)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    found = diff_files("a.mcap", "b.mcap")
+    assert "; possible cause: the result of C library: getenv() at tuned.py:2" in found.sentence
+    assert found.divergences[0].root_sentence.endswith("getenv() at tuned.py:2 is not recorded")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from rsltrace.job import load_job
-from rsltrace.run.provenance import SourceHashes, module_code, source_files
+from rsltrace.run.provenance import SourceHashes, environment, module_code, source_files
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
@@ -127,6 +128,26 @@ def test_imports_are_those_of_the_modules_that_are_known(tmp_path: Path) -> None
     }
 
 
+@pytest.mark.parametrize(
+    ("call", "found"),
+    [
+        ("importlib.import_module('plugins.fast')", ["plugins.fast"]),
+        ("importlib.import_module('plugins.' + NAME)", ["plugins.fast", "plugins.slow"]),
+        ("import_module(f'plugins.{NAME}')", ["plugins.fast", "plugins.slow"]),
+        ("__import__(NAME)", ["other", "plugins.fast", "plugins.slow"]),
+        ("import_module('.fast', __package__)", ["other", "plugins.fast", "plugins.slow"]),
+        ("import_module(f'')", ["other", "plugins.fast", "plugins.slow"]),
+        ("load('plugins.fast')", []),
+    ],
+)
+def test_modules_that_are_imported_by_name(tmp_path: Path, call: str, found: list[str]) -> None:
+    files = {}
+    for name in ("node", "other", "plugins.fast", "plugins.slow"):
+        files[name] = tmp_path / f"{name}.py"
+        files[name].write_text(f"plugin = {call}\n" if name == "node" else "")
+    assert json.loads(module_code(files)["node"])["imports"] == found
+
+
 @pytest.mark.filterwarnings("error")
 def test_what_is_not_python_is_left_out(tmp_path: Path) -> None:
     files = {}
@@ -167,3 +188,15 @@ def test_parameter_files_of_nodes_are_hashed(tmp_path: Path) -> None:
         "stop: {duration: 1s}\n"
     )
     assert "file:p.yaml" in source_files(load_job(tmp_path / "job.yaml"))
+
+
+def test_files_that_are_typed_are_hashed(tmp_path: Path) -> None:
+    (tmp_path / "typed.txt").write_text("start\n")
+    (tmp_path / "job.yaml").write_text("nodes: [{main: 'm:main', stdin: typed.txt}]\n")
+    assert "file:typed.txt" in source_files(load_job(tmp_path / "job.yaml"))
+
+
+def test_a_time_zone_that_is_not_pinned_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    for names, told in ((("CET", "CEST"), "CET/CEST"), (("JST", "JST"), "JST"), (("UTC",) * 2, "")):
+        monkeypatch.setattr(time, "tzname", names)
+        assert environment().get("time_zone", "") == told

@@ -23,7 +23,8 @@ TARGETS = ("node", "main", "executable", "script", "module", "program")
 class JobEntries:
     """``nodes`` are the full names of the nodes that an entry has constructed, by its number, as
     far as that is known. ``roots`` are the modules and files (``file:`` before them) that run in a
-    main, by its name, and in a node, by its full name; also a node's parameter files."""
+    main, by its name, and in a node, by its full name; with the files of parameters and of
+    terminal input of its entry."""
 
     nodes: dict[int, set[str]]
     roots: dict[str, set[str]]
@@ -52,8 +53,10 @@ def job_entries(trace: Trace, job: dict[str, Any]) -> JobEntries:
         targets = [str(entry.get(key)) for key in TARGETS if entry.get(key)]
         if targets and entry.get("start_after") is None and waiting.get(targets[0]):
             found[number] = waiting[targets[0]].pop(0)
-            for node in found[number]:
-                roots[node].update(f"file:{path}" for path in entry.get("parameter_files") or [])
+            typed = [one.get("file") for one in entry.get("stdin") or [] if isinstance(one, dict)]
+            files = [*(entry.get("parameter_files") or []), *filter(None, typed)]
+            for name in {*found[number], targets[0]} & roots.keys():
+                roots[name].update(f"file:{path}" for path in files)
     return JobEntries(found, roots)
 
 

@@ -359,7 +359,7 @@ class ErrorInTransition(Fact):
 @dataclass(frozen=True, slots=True)
 class UnrecordedAnswer(Fact):
     """An unrecorded external answer: a possible cause. ``source`` is the key of
-    ``guard:`` that keeps it."""
+    ``guard:`` that keeps it, "" if none does."""
 
     call: str
     place: str

@@ -454,8 +454,9 @@ def cause_of(of: Judgement) -> str:
         return ""
     text = sentence(of.why, of)
     if isinstance(of.likely, UnrecordedAnswer):
-        how = f"set guard: {{{of.likely.source}: record}} in the job"
-        text = f"{text}; {sentence(of.likely)} is not recorded (to record it, {how})"
+        source = of.likely.source
+        how = f" (to record it, set guard: {{{source}: record}} in the job)" if source else ""
+        text = f"{text}; {sentence(of.likely)} is not recorded{how}"
     elif isinstance(of.likely, UnguardedCall):
         more = f" and {of.likely.more} more calls" if of.likely.more else ""
         permission = f", which {of.likely.permission} lets differ"
