@@ -287,6 +287,7 @@ RUNS_CODE = {
     "rsltrace/adapters/rclpy/boundary/installation.py": "exec_module import_module",  # of rosidl
     "rsltrace/adapters/rclpy/executors/user_executors.py": "import_module",  # functions of rclpy
     "rsltrace/adapters/rclpy/parameter_overrides.py": "yaml",  # its parser's events, no objects
+    "rsltrace/run/provenance.py": "yaml",  # the same
     "rsltrace/guard/pin.py": "import_module",  # threadpoolctl
     "rsltrace/adapters/workspace/build_files.py": "compile exec import_module",  # setup.py
     # What a run, and only a run, does with code that its job names.

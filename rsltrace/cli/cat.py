@@ -362,7 +362,8 @@ def _choice(
     labels = [kind for kind in EventKind if kind.label in kinds]
     from_ns = 0 if first is None else first.stamp_ns(trace.start_ns, trace.end_ns)
     if from_ns > trace.end_ns:
-        tell_notes([f"--from {_after_the_end(trace)}"])
+        end = format_seconds(trace.end_ns - trace.start_ns)
+        tell_notes([f"--from is after the end of {trace.name}, {end} s"])
     to_ns = 2**64 - 1 if last is None else last.stamp_ns(trace.start_ns, trace.end_ns)
     if to_ns < from_ns:
         raise TraceError("--to is before --from")
@@ -373,11 +374,6 @@ def _choice(
         from_ns=from_ns,
         to_ns=to_ns,
     )
-
-
-def _after_the_end(trace: Trace) -> str:
-    end = format_seconds(trace.end_ns - trace.start_ns)
-    return f"is after the end of {trace.name}, {end} s"
 
 
 def _named(
@@ -484,8 +480,6 @@ def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) 
     with Trace.open(trace) as opened:
         tell_notes(notes_on(opened))
         at_ns = None if at is None else at.stamp_ns(opened.start_ns, opened.end_ns)
-        if at_ns is not None and at_ns > opened.end_ns:
-            raise TraceError(f"--at {_after_the_end(opened)}")
         reason = find_reason(opened, node, what, at_ns)
         if as_json:
             say(json.dumps(reason_json(reason), indent=2))

@@ -181,8 +181,10 @@ def user_stack(frame: FrameType | None, packages: frozenset[str]) -> str:
         kind = FILE_OWNERS[code_of(frame).co_filename]
         if kind in (USER, _PACKAGE) or (packages and is_in(frame, packages)):
             code = code_of(frame)
-            folder = module_of(frame).rpartition(".")[0].replace(".", "/")
             file = os.path.basename(code.co_filename)
+            module = module_of(frame)
+            package = module if file == "__init__.py" else module.rpartition(".")[0]
+            folder = package.replace(".", "/")
             place = f"{folder}/{file}" if folder else file
             name = getattr(code, "co_qualname", code.co_name)  # from Python 3.11 on
             lines.append(f"{place}:{frame.f_lineno} in {name}")

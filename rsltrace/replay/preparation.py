@@ -22,7 +22,7 @@ from rsltrace.replay.code import JobCodeFile, job_code_files, module_file
 from rsltrace.replay.edits import Edit, parse_edit
 from rsltrace.run.inputs import expand_launch_files
 from rsltrace.run.plans.recorded_order import last_ns
-from rsltrace.run.process import RunCallbacks
+from rsltrace.run.process import RunCallbacks, python_path
 from rsltrace.run.provenance import environment
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.model.event import EventKind
@@ -149,8 +149,9 @@ def _folder_markers(trace: Trace) -> list[str]:
 
 
 def _is_of_workspace(module: str) -> bool:
-    """Whether a module is installed in a sourced workspace, wherever the job's folder is."""
-    prefixes = installed_prefixes()
+    """Whether a module is found in a sourced workspace, or by ``PYTHONPATH``, wherever the job's
+    folder is."""
+    prefixes = [*installed_prefixes(), *python_path()]
     file = module_file(module, []) if prefixes else None
     return file is not None and any(map(file.is_relative_to, prefixes))
 

@@ -277,6 +277,12 @@ def _is_below(file: str, below: tuple[str, ...]) -> bool:
     return path.startswith(below) and _INSTALLED.isdisjoint(path.split(os.sep))
 
 
+def python_path() -> list[Path]:
+    """Return the folders of ``PYTHONPATH``."""
+    listed = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    return [Path(os.path.abspath(folder)) for folder in listed]
+
+
 def run_as_main(name: str) -> ModuleSpec | None:
     """Return the spec that ``python -m name`` runs: the module, or a package's ``__main__``.
 

@@ -9,6 +9,7 @@ import math
 import os
 import platform
 import sys
+import time
 import warnings
 import zlib
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
@@ -28,7 +29,14 @@ from rsltrace.job import Job
 from rsltrace.job.reading.substitute import installed_prefixes
 from rsltrace.job.values.checks import Target
 from rsltrace.run.plans.executables import executable_file
-from rsltrace.run.process import COPIED_FILES, is_below, is_pytest_module, run_as_main, user_modules
+from rsltrace.run.process import (
+    COPIED_FILES,
+    is_below,
+    is_pytest_module,
+    python_path,
+    run_as_main,
+    user_modules,
+)
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
     METADATA_CODE,
@@ -144,10 +152,14 @@ def _module_of_value(value: object) -> str:
 
 def module_code(modules: Mapping[str, Path], late: Container[str] = ()) -> dict[str, str]:
     """Return, as JSON for each Python module, the ``hash`` of its syntax tree, its ``imports`` of
-    the other modules, and if it is ``late``."""
+    the other modules, and if it is ``late``; for YAML and definitions of interfaces the ``hash`` of
+    all but comments and layout."""
     found = {}
     for name, path in modules.items():
         try:
+            if (text := _without_comments(path)) is not None:
+                found[name] = json.dumps({"hash": _hash(text.encode("utf-8", "surrogatepass"))})
+                continue
             if not is_python(path):
                 continue
             with warnings.catch_warnings():
@@ -156,11 +168,43 @@ def module_code(modules: Mapping[str, Path], late: Container[str] = ()) -> dict[
         except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
             continue
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        imports = sorted({*_imported(tree, package)} & {*modules} - {name})
-        digest = hashlib.sha256(ast.dump(tree).encode("utf-8", "surrogatepass")).hexdigest()[:16]
+        begins = tuple(_named_later(tree))
+        later = {one for one in modules if ":" not in one and one.startswith(begins)}
+        imports = sorted(({*_imported(tree, package)} & {*modules} | later) - {name})
+        digest = _hash(ast.dump(tree).encode("utf-8", "surrogatepass"))
         code: dict[str, object] = {"hash": digest, "imports": imports}
         found[name] = json.dumps(code | ({"late": True} if name in late else {}))
     return found
+
+
+def _without_comments(path: Path) -> str | None:
+    """Return what a file of YAML or a definition of an interface says; None for other files."""
+    if path.suffix in _DEFINITIONS:
+        lines = path.read_text("utf-8", "replace").splitlines()
+        words = (line.partition("#")[0].split() for line in lines)
+        return "\n".join(" ".join(line) for line in words if line)
+    if path.suffix in _YAML:
+        import yaml  # type: ignore[import-untyped]  # rclpy's, which most runs do not need
+
+        try:
+            return "".join(map(repr, yaml.parse(path.read_bytes())))
+        except yaml.YAMLError:
+            return None
+    return None
+
+
+def _named_later(tree: ast.Module) -> Iterator[str]:
+    """Yield how the names begin that ``import_module`` and the like are called with: "" if that is
+    not known."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and node.args:
+            called = getattr(node.func, "attr", None) or getattr(node.func, "id", "")
+            first: ast.AST = node.args[0]
+            while isinstance(first, ast.BinOp | ast.JoinedStr):
+                first = first.left if isinstance(first, ast.BinOp) else (first.values or [node])[0]
+            if called in _IMPORTERS:
+                text = str(first.value) if isinstance(first, ast.Constant) else ""
+                yield "" if text.startswith(".") else text
 
 
 def _imported(tree: ast.Module, package: str) -> Iterator[str]:
@@ -178,6 +222,9 @@ def _imported(tree: ast.Module, package: str) -> Iterator[str]:
             yield from (".".join(parts[:count]) for count in range(1, len(parts) + 1))
 
 
+_IMPORTERS = ("import_module", "__import__")
+_YAML = (".yaml", ".yml")
+_DEFINITIONS = (".msg", ".srv", ".action")
 _PACKAGES = ("rclpy", "numpy", "scipy", "rosbags", "mcap", "xxhash")
 
 
@@ -208,22 +255,41 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 def source_files(job: Job) -> dict[str, Path]:
     """Return the files of ``loaded_modules``, and the job's scripts, programs, executables,
-    libraries of components, parameter files of command lines and model files (``file:`` and what
-    the job calls them)."""
+    libraries of components, files of parameters, terminal input and models (``file:`` and what the
+    job calls them)."""
     modules = loaded_modules(job)
     modules.update(_run_as_main(job))
-    modules.update(_parameter_files(job))
+    modules.update(_input_files(job))
+    modules.update(_interface_files())
     modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
     return modules
 
 
+def _interface_files() -> Iterator[tuple[str, Path]]:
+    """Yield the definitions in the loaded packages of interfaces that are not ROS's own."""
+    ros = getattr(sys.modules.get("rclpy"), "__file__", None) or os.sep
+    for name, module in list(sys.modules.items()):
+        package, _, kind = name.partition(".")
+        file = getattr(module, "__file__", None)
+        if f".{kind}" not in _DEFINITIONS or not isinstance(file, str):
+            continue
+        for prefix in Path(file).parents:
+            folder = prefix / "share" / package / kind
+            if folder.is_dir():
+                if not Path(ros).is_relative_to(prefix):
+                    for path in sorted(folder.glob(f"*.{kind}")):
+                        yield f"file:{package}/{kind}/{path.name}", path
+                break
+
+
 def loaded_modules(job: Job) -> dict[str, Path]:
-    """Return the files of all modules loaded from the job's search path, by name; also those of its
-    entries' packages where they are installed, in a sourced workspace or with pip.
+    """Return the files of all modules loaded from the job's search path or ``PYTHONPATH``, by name;
+    also those of its entries' packages where they are installed, in a sourced workspace or with
+    pip.
 
     Test modules are left out unless a node is in one.
     """
-    folders = [str(job.resolve(folder)) for folder in job.search_path]
+    folders = [*map(str, map(job.resolve, job.search_path)), *map(str, python_path())]
     of_nodes = {_module_of(target) for spec in job.nodes for target in (spec.node, spec.main)}
     copied = {name: Path(file) for name, file in COPIED_FILES.items() if is_below(file, folders)}
     return {
@@ -267,14 +333,14 @@ class SourceHashes:
         """Add the modules of a job that have been loaded since."""
         if (loaded := _loaded_names()) != self._loaded:  # to look at all their files takes long
             self._loaded = loaded
-            self.add(loaded_modules(job), late=late)
+            self.add({**loaded_modules(job), **dict(_interface_files())}, late=late)
 
     def add(self, files: Mapping[str, Path], *, late: bool = False) -> None:
         """Add the files that are new. ``late``: callbacks have loaded them, which they may do in
         one run and not in another of the same code."""
         for name in files.keys() - self._files.keys():
             with suppress(OSError):  # it has been removed since, or is in an archive
-                self._hashes[name] = _file_hash(files[name])
+                self._hashes[name] = _hash(files[name].read_bytes())
                 self._files[name] = files[name]
                 self._late |= {name} if late else set()
         if self._hashes.keys() != self._written:
@@ -291,8 +357,8 @@ def _loaded_names() -> set[str]:
     return sys.modules.keys() | COPIED_FILES.keys()
 
 
-def _file_hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]
 
 
 def _run_as_main(job: Job) -> Iterator[tuple[str, Path]]:
@@ -327,11 +393,15 @@ def _library_of(component: str) -> Path | None:
     return None
 
 
-def _parameter_files(job: Job) -> Iterator[tuple[str, Path]]:
+def _input_files(job: Job) -> Iterator[tuple[str, Path]]:
+    paths = [path for spec in job.nodes for path in spec.parameter_files]
+    paths += [one.file for spec in job.nodes for one in spec.stdin or () if one.file is not None]
     for words in (job.ros_arguments, *(spec.arguments for spec in job.nodes)):
-        for flag, path in pairwise(words):
-            if flag == "--params-file" and job.resolve(path).is_file():
-                yield f"file:{path}", job.resolve(path)
+        paths += [path for flag, path in pairwise(words) if flag == "--params-file"]
+    for path in paths:
+        file = job.resolve(path)
+        if file.is_file():
+            yield f"file:{os.path.relpath(file, job.base_dir)}", file
 
 
 def _module_of(target: Target | None) -> str:
@@ -405,6 +475,8 @@ def environment(job: Job | None = None) -> dict[str, str]:
     }
     if options := _python_options():
         values["python_options"] = options
+    if (zone := "/".join(dict.fromkeys(time.tzname))) != "UTC":  # of runs that are not pinned
+        values["time_zone"] = zone
     values.update(_versions())
     kernels = "" if job is None else numerical_libraries(job)
     if kernels:

@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.diff import diff_files
+from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.result import Diff
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
@@ -245,3 +246,118 @@ def test_of_a_package_that_a_workspace_has_installed(
             sys.modules.pop(module, None)
     assert cause("a.mcap", "b.mcap") == ["code of module factory_bot.nodes"]
     assert "factory_bot.nodes" in command("replay", "a.mcap").stderr
+
+
+_TUNED = """
+import sys
+from rclpy.node import Node
+from std_msgs.msg import Float64
+class Tuned(Node):
+    def __init__(self):
+        super().__init__("tuned")
+        gain = self.declare_parameter("gain", 1.0).value
+        out = self.create_publisher(Float64, "tuned", 10)
+        self.create_timer(0.1, lambda: out.publish(Float64(data=gain + BIAS)))
+"""
+
+
+def test_of_the_content_of_a_parameter_file(
+    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not if only its comments differ, nor if the parameters are the same."""
+    (tmp_path / "tuned.py").write_text(_TUNED.replace("BIAS", "sys.hidden"))
+    (tmp_path / "job.yaml").write_text(
+        "nodes: [{node: tuned:Tuned, parameter_files: [p.yaml]}]\nstop: {duration: 500ms}\n"
+    )
+    text = "/**: {ros__parameters: {gain: %s, unused: %s}}%s\n"
+    for name, values, hidden in (
+        ("a", (1.5, 1, ""), 0.0),
+        ("other", (2.5, 1, ""), 0.0),
+        ("comment", (1.5, 1, "  # tuned"), 1.0),
+        ("unused", (1.5, 2, ""), 1.0),
+    ):
+        (tmp_path / "p.yaml").write_text(text % values)
+        monkeypatch.setattr(sys, "hidden", hidden, raising=False)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    found = diff_files("a.mcap", "other.mcap")
+    assert found.verdict is Verdict.ENVIRONMENT
+    assert found.sentence.startswith(
+        "parameter gain of /tuned 1.5 → 2.5 (file p.yaml); first effect: /tuned published"
+    )
+    assert [cause("a.mcap", f"{name}.mcap") for name in ("comment", "unused")] == [[], []]
+
+
+def test_of_a_module_that_pythonpath_leads_to(
+    package: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (package / "tuned.py").write_text(_TUNED.replace("BIAS", "tables.BIAS"))
+    (package / "tuned.py").write_text("import tables\n" + (package / "tuned.py").read_text())
+    (package / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for name in ("a", "b"):
+        folder = package.parent / f"{package.name}_{name}"
+        folder.mkdir()
+        (folder / "tables.py").write_text(f"BIAS = {ord(name)}.0\n")
+        with monkeypatch.context() as patched:
+            patched.setenv("PYTHONPATH", str(folder))
+            patched.syspath_prepend(folder)
+            assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+        sys.modules.pop("tables", None)
+    assert cause("a.mcap", "b.mcap") == ["code of module tables"]
+    assert "tables" in command("replay", "a.mcap").stderr
+
+
+_STARTS = """
+import time
+import rclpy
+def main():
+    rclpy.init()
+    node = rclpy.create_node("starts")
+    for _ in range(STEPS):
+        time.sleep(0.1)
+    node.create_timer(0.2, lambda: None)
+    rclpy.spin(node)
+"""
+
+
+def test_a_main_that_spins_until_the_run_ends_does_not_sleep(
+    tmp_path: Path, command: Callable[..., Any]
+) -> None:
+    (tmp_path / "job.yaml").write_text("nodes: [{main: starts:main}]\nstop: {duration: 500ms}\n")
+    for name, steps in (("a", 2), ("b", 1)):
+        (tmp_path / "starts.py").write_text(f"STEPS = {steps}\n{_STARTS}")
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    sentence = diff_files("a.mcap", "b.mcap").sentence
+    assert "slept 100 ms in a but not in b" in sentence, sentence
+
+
+_TYPED = """
+import rclpy
+from std_msgs.msg import String
+def main():
+    rclpy.init()
+    out = rclpy.create_node("typed").create_publisher(String, "typed", 10)
+    out.publish(String(data=input()))
+"""
+
+
+def test_of_what_is_typed(tmp_path: Path, command: Callable[..., Any]) -> None:
+    (tmp_path / "typed.py").write_text(_TYPED)
+    (tmp_path / "job.yaml").write_text("nodes: [{main: 'typed:main', stdin: typed.txt}]\n")
+    for name in ("a", "b"):
+        (tmp_path / "typed.txt").write_text(f"{name}\n")
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    assert cause("a.mcap", "b.mcap") == ["file typed.txt"]
+
+
+def test_what_the_c_library_answers_is_a_possible_cause(
+    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = "import ctypes\nread = ctypes.CDLL(None).getenv\nread.restype = ctypes.c_char_p\n"
+    (tmp_path / "tuned.py").write_text(node + _TUNED.replace("BIAS", "len(read(b'FAULT'))"))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for name, value in (("a", "1"), ("b", "12")):
+        monkeypatch.setenv("FAULT", value)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    found = diff_files("a.mcap", "b.mcap")
+    assert "; possible cause: the result of C library: getenv() at tuned.py:2" in found.sentence
+    assert found.divergences[0].root_sentence.endswith("getenv() at tuned.py:2 is not recorded")

@@ -183,6 +183,23 @@ def test_call_that_the_job_permits(
         assert found.divergences[0].next_step == "rsltrace audit headline_source.py"
 
 
+def test_call_that_the_job_permits_in_a_module_that_the_node_imports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "headline_clock.py").write_text(
+        "import time\ndef read():\n    return time.time_ns()\n"
+    )
+    changes = (
+        ("import time\n", "import headline_clock\n"),
+        ("data=self.count", "data=headline_clock.read()"),
+        (STOP, f"guard: false\n{STOP}"),
+    )
+    found = rsltrace.diff(*(recorded(tmp_path, f"{name}.mcap", *changes) for name in "ab"))
+    assert "; possible cause: time.time_ns() at headline_clock.py:3" in found.sentence
+    assert found.divergences[0].next_step == "rsltrace audit headline_clock.py"
+
+
 LATCHED = (
     (
         "import time\n",

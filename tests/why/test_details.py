@@ -200,3 +200,55 @@ def test_of_a_run_that_was_cut_before_its_first_event_nothing_ran(
         if asked.returncode != 2:  # the first cut with the graph, and yet without an event
             break
     assert "client /close of /picker has sent nothing (picker.py:" in asked.stdout
+
+
+@pytest.mark.ros
+def test_a_timer_that_is_destroyed_did_not_run_as_expected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "short.py").write_text(
+        "from rclpy.node import Node\n"
+        "class Short(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('short')\n"
+        "        self.count = 0\n"
+        "        self.timer = self.create_timer(0.1, self.tick)\n"
+        "        self.create_timer(0.1, lambda: None)\n"
+        "    def tick(self):\n"
+        "        self.count += 1\n"
+        "        if self.count == 3: self.destroy_timer(self.timer)\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: short:Short}]\nstop: {duration: 1s}\n")
+    monkeypatch.chdir(tmp_path)
+    run(load_job("job.yaml"), "run.mcap")
+    with Trace.open("run.mcap") as trace:
+        at = {tenths: why(trace, "/short", "tick", tenths * 10**8) for tenths in (3, 4, 8, 90)}
+    assert "ran as expected, 3 times" in at[3].words()
+    assert not at[4].is_reason
+    for later in (8, 90):
+        assert "was destroyed" in at[later].words()
+        assert "did not run after 0.3 s, and its period is 100 ms" in at[later].words()
+
+
+@pytest.mark.ros
+def test_after_the_end_of_a_run_nothing_is_expected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "echo.py").write_text(
+        "from rclpy.node import Node\n"
+        "from std_msgs.msg import String\n"
+        "class Echo(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('echo')\n"
+        "        out = self.create_publisher(String, '/x', 1)\n"
+        "        self.create_timer(0.1, lambda: out.publish(String()))\n"
+        "        self.create_subscription(String, '/x', self.heard, 1)\n"
+        "    def heard(self, m): pass\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: echo:Echo}]\nstop: {duration: 1s}\n")
+    monkeypatch.chdir(tmp_path)
+    run(load_job("job.yaml"), "run.mcap")
+    with Trace.open("run.mcap") as trace:
+        found = why(trace, "/echo", "heard", 9 * 10**9)
+    assert "was due at 9.0 s, and the run ended at 1.0 s" in found.words()
+    assert not found.is_reason

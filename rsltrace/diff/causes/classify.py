@@ -28,7 +28,6 @@ from rsltrace.diff.facts.causes import (
     Loss,
     NoEarlierDifference,
     NotDelivered,
-    ParameterFiles,
     Root,
     SleepTimes,
     Verdict,
@@ -38,8 +37,6 @@ from rsltrace.diff.facts.evidence import (
     EntityChanges,
     EventSummary,
     MessageDifference,
-    ParameterChanges,
-    ParameterValues,
     Presence,
     Setting,
     StateDifference,
@@ -217,25 +214,13 @@ def _construction(case: DivergenceCase) -> Judgement:
     else:
         verdict, root = Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK
         what = DivergenceKind.OTHER_CONSTRUCTION_SAME_JOB
-    return case.judgement(verdict, root, what, _why_constructed(case))
+    return case.judgement(verdict, root, what, CauseKind.CONSTRUCTOR)
 
 
 def _is_stamp_of_parameters(message: MessageDifference) -> bool:
     """Whether parameters that are the same were declared at another time."""
     paths = [field.path for field in message.fields]
     return message.topic == PARAMETER_EVENTS and paths == ["stamp"] and not message.more_fields
-
-
-def _why_constructed(case: DivergenceCase) -> CauseFact:
-    """Say why a constructor may have done something else in the same job and environment."""
-    names = [
-        value[0]
-        for message in case.messages
-        if isinstance(message.fate, ParameterValues | ParameterChanges)
-        for value in message.fate.values
-    ]
-    files = case.relevance.parameter_files
-    return ParameterFiles(tuple(names), tuple(files)) if names and files else CauseKind.CONSTRUCTOR
 
 
 def _schedule(case: DivergenceCase) -> Judgement:

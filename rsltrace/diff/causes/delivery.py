@@ -258,9 +258,10 @@ def _slept_ns(run: ComparedTrace, view: EventSummary, *, back: bool) -> int | No
         rows = load_rows(run, view.index + 1, view.index + 1 + _LOOKED_AT_MAX)
         for place in range(len(rows)):
             if rows.number[place] == number:
-                slept = rows.kind[place] == EventKind.RESUME and rows.cause[place] == NO_EVENT
-                slept_ns = rows.stamp[place] - view.stamp_ns
-                return slept_ns or None if slept else None
+                woke = rows.kind[place] == EventKind.RESUME and rows.cause[place] == NO_EVENT
+                until_ns = rows.stamp[place]  # the end of the run wakes whoever waits
+                slept_ns = until_ns - view.stamp_ns if until_ns < run.trace.end_ns else 0
+                return slept_ns or None if woke else None
     return None
 
 

@@ -23,7 +23,8 @@ TARGETS = ("node", "main", "executable", "script", "module", "program")
 class JobEntries:
     """``nodes`` are the full names of the nodes that an entry has constructed, by its number, as
     far as that is known. ``roots`` are the modules and files (``file:`` before them) that run in a
-    main, by its name, and in a node, by its full name."""
+    main, by its name, and in a node, by its full name; with the files of parameters and of
+    terminal input of its entry."""
 
     nodes: dict[int, set[str]]
     roots: dict[str, set[str]]
@@ -52,14 +53,22 @@ def job_entries(trace: Trace, job: dict[str, Any]) -> JobEntries:
         targets = [str(entry.get(key)) for key in TARGETS if entry.get(key)]
         if targets and entry.get("start_after") is None and waiting.get(targets[0]):
             found[number] = waiting[targets[0]].pop(0)
+            typed = [one.get("file") for one in entry.get("stdin") or [] if isinstance(one, dict)]
+            files = [*(entry.get("parameter_files") or []), *filter(None, typed)]
+            for name in {*found[number], targets[0]} & roots.keys():
+                roots[name].update(f"file:{path}" for path in files)
     return JobEntries(found, roots)
+
+
+def module_of(place: str) -> str:
+    """Return the module of a place: ``bot.arm`` of ``bot/arm.py:24``."""
+    file = place.rpartition(":")[0]
+    return file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
 def _roots(trace: Trace, main: Entity) -> set[str]:
     """Return what a main runs: its file, and the module of its function."""
-    place = main.source.rpartition(":")[0]
-    module = place.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    return {f"file:{main.name}", module} & trace.metadata(METADATA_SOURCES).keys()
+    return {f"file:{main.name}", module_of(main.source)} & trace.metadata(METADATA_SOURCES).keys()
 
 
 def _constructed(trace: Trace) -> Iterator[list[Entity]]:

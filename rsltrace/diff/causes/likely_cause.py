@@ -17,7 +17,8 @@ from rsltrace.diff.causes.calls import (
 )
 from rsltrace.diff.causes.delivery import entity_changes, topics_of
 from rsltrace.diff.causes.event_views import subject_of
-from rsltrace.diff.causes.relevance import Relevance
+from rsltrace.diff.causes.job_entries import module_of
+from rsltrace.diff.causes.relevance import Relevance, used_by
 from rsltrace.diff.facts.causes import (
     DivergenceKind,
     ErrorInTransition,
@@ -44,6 +45,9 @@ from rsltrace.trace.words.code import code_file, code_place
 
 _OF_PROGRAMS = ("os.read()", "os.waitpid()")
 """What ``subprocess`` asks of the system about the program that it has started."""
+
+_HELPERS_MAX = 30
+"""Modules that are audited."""
 
 _OPEN_TO_IT = frozenset(
     (Root.CALLBACK, Root.TIMING, Root.MISSING, Root.EXTRA, Root.EXCEPTION, Root.SCHEDULE, Root.JOB)
@@ -203,15 +207,21 @@ def _is_as_recorded(run: ComparedTrace, file: Path) -> bool:
 def _audited_calls(
     run: ComparedTrace, view: EventSummary, sources: Collection[str]
 ) -> list[tuple[str, str, str, str]] | None:
-    """Return what an audit finds of some sources in the code of an event: file, place, call and
-    source; None for nothing, or if the code is not here as it was recorded."""
+    """Return what an audit finds of some sources in the code of an event, else in a module that
+    this imports: file, place, call and source; None for nothing, or if the code is not here as it
+    was recorded."""
     place = code_place(run.trace, run.trace.event(view.index))
-    found = code_file(run.trace, place)
-    if found is None or not _is_as_recorded(run, found[0]):
-        return None
-    module = place.rpartition(":")[0]
-    lines = _audited_lines(*found, sources)
-    return [(str(found[0]), f"{module}:{line}", *called) for line, called in lines] or None
+    own = module_of(place)
+    helpers = sorted(used_by((run.trace, run.trace), own) - {own})[:_HELPERS_MAX]
+    paths = [name.replace(".", "/") for name in helpers]
+    for one in (place, *(f"{path}{end}:0" for path in paths for end in (".py", "/__init__.py"))):
+        found = code_file(run.trace, one)
+        if found is not None and _is_as_recorded(run, found[0]):
+            lines = _audited_lines(*found, sources)
+            if lines:
+                name = one.rpartition(":")[0]
+                return [(str(found[0]), f"{name}:{line}", *called) for line, called in lines]
+    return None
 
 
 def _audited_lines(

@@ -21,7 +21,7 @@ from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import METADATA_CODE, METADATA_EDITS, METADATA_SOURCES
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
-from rsltrace.trace.model.texts import printable, ros_release
+from rsltrace.trace.model.texts import ros_release
 from rsltrace.trace.reader import Trace
 
 # What differs outside of the events and the job: the environment, the code, the entities of the
@@ -53,6 +53,8 @@ def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
                 continue  # older traces do not tell it
             if of_a.get(name) != of_b.get(name) and not (is_code and _same_code(a, b, name)):
                 file = name.removeprefix("file:")
+                if file != name and None in (of_a.get(name), of_b.get(name)):
+                    continue  # the jobs name other files, which is a setting of its own
                 kind_of_it = kind if file == name else SettingKind.FILE
                 value_a, value_b = (_with_release(name, of.get(name)) for of in (of_a, of_b))
                 found.append(Setting(kind_of_it, file, value_a, value_b))
@@ -163,6 +165,8 @@ class Relevance:
         if setting.kind is SettingKind.CODE:
             return self._is_code_of(setting.name, place)
         if setting.kind is SettingKind.FILE:
+            if setting.name in self._parameter_files and not place.constructing:
+                return False
             return self._is_code_of(f"file:{setting.name}", place)
         key, *rest = setting.key.split(".") if setting.key else [""]
         if key in _NEVER or (key in _WHEN and place.inside):
@@ -279,11 +283,12 @@ class Relevance:
         )
 
     @cached_property
-    def parameter_files(self) -> list[str]:
-        """The parameter files of all nodes, whose content is not in the trace."""
+    def _parameter_files(self) -> set[str]:
+        """The parameter files of nodes and of command lines (with their other words)."""
         nodes = [node for job in self._jobs for node in job.get("nodes") or []]
-        files = [_value(node, "parameter_files") or [] for node in nodes]
-        return [printable(str(file)) for of_node in files for file in of_node]
+        lists = [node.get(key) for node in nodes for key in ("parameter_files", "arguments")]
+        lists += [job.get("ros_arguments") for job in self._jobs]
+        return {str(word) for words in lists if isinstance(words, list) for word in words}
 
     @cached_property
     def _traces(self) -> tuple[Trace, Trace]:

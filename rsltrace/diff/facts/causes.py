@@ -257,14 +257,6 @@ class CauseKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class ParameterFiles(Fact):
-    """Parameters differ that a parameter file may give: its content is not in the trace."""
-
-    parameters: tuple[str, ...]
-    files: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class WaitInOneRun(Fact):
     """A callback that waited, in one run only, for what ``cause`` sent."""
 
@@ -321,7 +313,6 @@ class SameCause(Fact):
 
 CauseFact = (
     CauseKind
-    | ParameterFiles
     | WaitInOneRun
     | NotDelivered
     | DifferentSenders
@@ -368,7 +359,7 @@ class ErrorInTransition(Fact):
 @dataclass(frozen=True, slots=True)
 class UnrecordedAnswer(Fact):
     """An unrecorded external answer: a possible cause. ``source`` is the key of
-    ``guard:`` that keeps it."""
+    ``guard:`` that keeps it, "" if none does."""
 
     call: str
     place: str

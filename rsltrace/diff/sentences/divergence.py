@@ -26,7 +26,6 @@ from rsltrace.diff.facts.causes import (
     NoEventsLeft,
     NoMoreMessages,
     NotDelivered,
-    ParameterFiles,
     QueueOverflow,
     RunEnd,
     SameCause,
@@ -454,8 +453,9 @@ def cause_of(of: Judgement) -> str:
         return ""
     text = sentence(of.why, of)
     if isinstance(of.likely, UnrecordedAnswer):
-        how = f"set guard: {{{of.likely.source}: record}} in the job"
-        text = f"{text}; {sentence(of.likely)} is not recorded (to record it, {how})"
+        source = of.likely.source
+        how = f" (to record it, set guard: {{{source}: record}} in the job)" if source else ""
+        text = f"{text}; {sentence(of.likely)} is not recorded{how}"
     elif isinstance(of.likely, UnguardedCall):
         more = f" and {of.likely.more} more calls" if of.likely.more else ""
         permission = f", which {of.likely.permission} lets differ"
@@ -679,13 +679,6 @@ SENTENCES.update(
         ),
         CauseKind.FAULT_IN_ONE: lambda fact, of: (
             because_of(of.settings) or f"only the job of {_has(of)[0]} has this fault"
-        ),
-        ParameterFiles: lambda fact, of: (
-            because_of(of.settings)
-            or (
-                f"parameter {listed(fact.parameters)}: a parameter file ({listed(fact.files)}) or "
-                "the constructor sets a different value"
-            )
         ),
         DifferentSenders: lambda fact, of: (
             f"in a it came from {phrase(fact.a)} (event {fact.a.index}), in b from "

@@ -108,7 +108,7 @@ def _lead(settings: Sequence[Setting], constructor: Judgement | None) -> str:
     of_job = [_setting(setting) for setting in settings if setting.key]
     if of_job or constructor is None:
         return listed(of_job)
-    code = [setting.place for setting in settings if setting.kind is SettingKind.CODE]
+    code = [s.place for s in settings if s.kind in (SettingKind.CODE, SettingKind.FILE)]
     parameters = _parameters(constructor)
     if code and parameters:
         return f"{listed(parameters)} ({listed(code)})"

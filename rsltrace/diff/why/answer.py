@@ -151,7 +151,10 @@ def why(trace: Trace, node: str, asked: str, at_ns: int | None = None) -> Reason
     if found.entity.kind is EntityKind.SUBSCRIPTION and found.entity.name in unseen:
         topic = found.entity.name
         raise TraceError(f"{trace.name} cannot tell: {unseen_text([topic], unseen[topic])}")
-    return _solve(found)
+    if at_ns is None or at_ns <= trace.end_ns:
+        return _solve(found)
+    until_then = _solve(replace(found, at_ns=trace.end_ns))
+    return until_then if until_then.is_reason else RunEnded.at(found, at_ns)
 
 
 def _solve(question: Question) -> Reason:

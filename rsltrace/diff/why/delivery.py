@@ -333,6 +333,31 @@ class ClockStands(Reason):
         )
 
 
+@dataclass(frozen=True)
+class TimerGone(Reason):
+    """A timer did not run at the time that is asked about, and nothing kept it from running: no
+    trace tells when a timer is destroyed."""
+
+    last_ns: int
+    period_ns: int
+
+    @classmethod
+    def after(cls, question: Question, last_ns: int, period_ns: int) -> Reason | None:
+        timer, at_ns = question.entity, question.at_ns
+        changed = any(question.history.outputs_of([timer.id], OutputKind.TIMER))
+        if at_ns is None or not period_ns or changed or question.rules("clocks"):
+            return None
+        is_gone = at_ns - last_ns > 2 * period_ns
+        return cls(last_ns, period_ns, question=question, place=question.place) if is_gone else None
+
+    def words(self) -> str:
+        period = f"its period is {format_duration(self.period_ns)}"
+        return (
+            f"{self.question.name} was destroyed, or nothing spins its node: it did not run after "
+            f"{self.seconds(self.last_ns)} s, and {period}"
+        )
+
+
 class TimerLate:
     """A timer that was ``Busy`` longest, or not due before the end of the run."""
 
@@ -350,4 +375,5 @@ class TimerLate:
         if question.at_ns is not None:
             gaps = [gap for gap in gaps if gap[0] <= question.at_ns][-1:]
         from_ns, to_ns = max(gaps, key=lambda gap: gap[1] - gap[0], default=(0, 0))
-        return Busy.between(question, from_ns + (period_ns or ZERO_PERIOD_NS), to_ns)
+        busy = Busy.between(question, from_ns + (period_ns or ZERO_PERIOD_NS), to_ns)
+        return busy or TimerGone.after(question, from_ns, period_ns)
