@@ -22,7 +22,7 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from rsltrace._version import __version__
-from rsltrace.adapters.processes.build import is_python
+from rsltrace.adapters.processes.build import PRELOADED, is_python
 from rsltrace.guard.callers import is_rsltrace_module, is_user_file
 from rsltrace.guard.pin import HASH_SEED, import_threadpoolctl
 from rsltrace.job import Job
@@ -222,6 +222,7 @@ def _imported(tree: ast.Module, package: str) -> Iterator[str]:
             yield from (".".join(parts[:count]) for count in range(1, len(parts) + 1))
 
 
+_LIBRARIES_OF_ROS = ("librcl.so", "librclcpp.so")
 _IMPORTERS = ("import_module", "__import__")
 _YAML = (".yaml", ".yml")
 _DEFINITIONS = (".msg", ".srv", ".action")
@@ -391,6 +392,29 @@ def _library_of(component: str) -> Path | None:
                 if name == plugin:
                     return prefix / library
     return None
+
+
+def own_libraries(job: Job, files: Iterable[str]) -> dict[str, Path]:
+    """Return which code files are libraries and plugins of the job's folders, of a workspace or of
+    ``LD_LIBRARY_PATH``, by ``file:`` and their names: none of the system, of ROS or of rsltrace."""
+    prefixes = installed_prefixes()
+    listed = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
+    folders = [
+        *map(str, map(job.resolve, job.search_path)),
+        *map(str, prefixes),
+        *filter(None, listed),
+    ]
+    found = {}
+    for path in map(Path, sorted(files)):
+        if ".so" not in path.name or path.name in PRELOADED:
+            continue
+        if any((path.parent / name).exists() for name in _LIBRARIES_OF_ROS):
+            continue
+        # A workspace may have links to where its packages are built.
+        linked = any((prefix / "lib" / path.name).exists() for prefix in prefixes)
+        if linked or is_below(str(path), folders):
+            found[f"file:{path.name}"] = path
+    return found
 
 
 def _input_files(job: Job) -> Iterator[tuple[str, Path]]:

@@ -59,6 +59,7 @@ from rsltrace.run.provenance import (
     LateLibraryScan,
     SourceHashes,
     environment,
+    own_libraries,
     payload_filter,
     source_files,
     write_job,
@@ -443,6 +444,8 @@ class RunSession:
     def _add_sources(self, *, late: bool = False) -> None:
         if self._sources is not None:
             self._sources.add_loaded(self.job, late=late)
+            for process in self._processes.processes:
+                self._sources.add(own_libraries(self.job, process.code_files))
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. Failures are in ``error``."""

@@ -16,6 +16,7 @@ from rsltrace.adapters.processes.source_lines import callback_place, stack_text
 from rsltrace.errors import NodeError, SetupError
 from rsltrace.job import load_job
 from rsltrace.run import run
+from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.reader import Trace
 
@@ -129,3 +130,37 @@ def test_a_crash_when_the_run_is_over_is_a_note(tmp_path: Path) -> None:
     notes = [note for note in result.notes if "was killed by SIGSEGV when the run was over" in note]
     assert len(notes) == 1
     assert " at robot.cpp:16 in crash(" in notes[0]
+
+
+_LOADS = """
+#include <csignal>
+#include <dlfcn.h>
+#include <unistd.h>
+int gain();
+int main() {
+  gain();
+  std::signal(SIGINT, [](int) {});
+  dlopen("libplugin.so", RTLD_NOW);
+  sleep(9);
+}
+"""
+
+
+def test_libraries_of_a_process_are_part_of_the_code_of_a_run(tmp_path: Path) -> None:
+    """Those that it is linked with, and those that it loads itself; none of the system."""
+    try:
+        compiler = find_compiler()
+    except SetupError as error:
+        pytest.skip(str(error))
+    for name, text in (("gain", "int gain() { return 1; }"), ("plugin", "int plugin;")):
+        (tmp_path / f"{name}.cpp").write_text(text)
+        shared = ["-fPIC", "-shared", f"{name}.cpp", "-o", f"lib{name}.so"]
+        subprocess.run([*compiler, *shared], check=True, cwd=tmp_path)
+    (tmp_path / "robot.cpp").write_text(_LOADS)
+    linked = ["robot.cpp", "-L.", "-lgain", "-Wl,-rpath,$ORIGIN", "-ldl", "-o", "robot"]
+    subprocess.run([*compiler, *linked], check=True, cwd=tmp_path)
+    (tmp_path / "job.yaml").write_text("nodes: [{program: robot}]\nstop: {duration: 1s}\n")
+    assert run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error is None
+    with Trace.open(tmp_path / "t.mcap") as trace:
+        hashed = {name for name in trace.metadata(METADATA_SOURCES) if ".so" in name}
+    assert hashed == {"file:libgain.so", "file:libplugin.so"}

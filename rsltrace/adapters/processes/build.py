@@ -37,6 +37,8 @@ OBSERVER = (
 _STUB_SOURCE = SOURCES / "python_symbols" / "symbols.cpp"
 _NAME = "librmw_rsltrace.so"
 _STUB = "librsltrace_python_symbols.so"
+PRELOADED = (_NAME, _STUB)
+"""What processes load of rsltrace."""
 _DIGEST = "digest"
 _HEADERS = ("rmw/rmw/rmw.h", "rcl/rcl/rcl.h", "fastcdr/Cdr.h")
 _LIBRARIES = ("rmw", "rcutils", "fastcdr", "rosidl_runtime_c")

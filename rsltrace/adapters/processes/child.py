@@ -229,6 +229,16 @@ class ProcessHandle:
     def pid(self) -> int:
         return self._process.pid
 
+    def code_files(self) -> set[str]:
+        """Return the files that it has loaded as code: the program, libraries, plugins."""
+        found = set()
+        with suppress(OSError):
+            for line in Path(f"/proc/{self.pid}/maps").read_text(errors="replace").splitlines():
+                _, access, *_, path = line.split(maxsplit=5)
+                if "x" in access and path.startswith("/"):
+                    found.add(path)
+        return found
+
     def send(self, data: bytes) -> None:
         """Send to the process; one that is gone is noticed by ``receive``."""
         told, size = self._told, len(data)

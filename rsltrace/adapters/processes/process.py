@@ -143,6 +143,8 @@ class Process:
         self._waking_soon = False
         self._last: WaitableEntity | None = None
         self._is_stopping = False
+        self.code_files: set[str] = set()
+        """What it had loaded when it started and when the run ended."""
         self._crashed_at: list[str] = []
         """The lines of its own code, innermost first."""
         self._graph = GraphChange(self)
@@ -419,6 +421,7 @@ class Process:
                 self.dispatcher.recorder = recorder
             if self.ended is not None:
                 return
+        self.code_files |= self.child.code_files()
         self.child.send(RECORD.pack(0, CommandKind.STOP))
         self._converse()
         if self.ended is None:
@@ -441,6 +444,7 @@ class Process:
     # -- what it asks ----------------------------------------------------------------------------
 
     def _hello(self, fields: RecordReader) -> bytes:
+        self.code_files |= self.child.code_files()
         adapter, now_ns = self.adapter, self.dispatcher.loop.now_ns
         seed, own_clocks = adapter.seed_of(self.key), adapter.clock is not None
         return _HELLO.pack(now_ns, seed, own_clocks, self.instant_sleep, self.intra_process)
