@@ -108,12 +108,15 @@ class Server(Node):
 
 def serve():
     rclpy.init()
-    executor = MultiThreadedExecutor(2)
-    executor.add_node(Server())
+    node, executor = Server(), MultiThreadedExecutor(2)
+    executor.add_node(node)
     try:
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    # Its threads end before the node does: it may crash otherwise, and with it goes what it traced.
+    # rclpy's own shutdown does not wait for them.
+    executor._executor.shutdown()
 """
 JOB = """\
 nodes:
