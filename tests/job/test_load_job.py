@@ -202,6 +202,9 @@ def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(JobError) as caught:
         load_job(tmp_path / "robot.yml")
     assert str(caught.value).endswith(f"; did you mean '{tmp_path}/robot.yaml'?")
+    with pytest.raises(JobError) as caught:
+        load_job("nowhere/run.mcap")
+    assert str(caught.value) == "nowhere/run.mcap: there is no such trace"
 
 
 def test_a_folder(folder: Path) -> None:

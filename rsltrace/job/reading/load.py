@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -172,18 +172,17 @@ def _parse(name: str) -> YamlSource:
     return parse_yaml(_read(Path(name)), name, folder=folder)
 
 
-def _beside(path: Path) -> str:
-    """Say which file of the folder was probably meant."""
-    try:
-        files = {file.stem: file.name for file in sorted(path.parent.iterdir()) if _is_job(file)}
-    except OSError:
-        return ""
+def _not_there(path: Path) -> str:
+    """Say that a file is missing, and which one of its folder was probably meant."""
+    kind, suffixes = "job file", (".yaml", ".yml", ".json")
+    if path.suffix == ".mcap":  # of a command that takes traces and jobs
+        kind, suffixes = "trace", (".mcap",)
+    files = {}
+    with suppress(OSError):
+        files = {f.stem: f.name for f in sorted(path.parent.iterdir()) if f.suffix in suffixes}
     near = nearest(path.stem, files)
-    return f"; did you mean {str(path.with_name(files[near]))!r}?" if near else ""
-
-
-def _is_job(file: Path) -> bool:
-    return file.suffix in (".yaml", ".yml", ".json")
+    meant = f"; did you mean {str(path.with_name(files[near]))!r}?" if near else ""
+    return f"there is no such {kind}{meant}"
 
 
 def _read(path: Path) -> str:
@@ -191,7 +190,7 @@ def _read(path: Path) -> str:
     try:
         data = read_regular(path, SIZE_MAX + 1)
     except FileNotFoundError:
-        raise JobError(f"there is no such job file{_beside(path)}", where=name) from None
+        raise JobError(_not_there(path), where=name) from None
     except IsADirectoryError:
         inside = path / "job.yaml"
         advice = f"name the job file in it: {inside}" if inside.is_file() else "name a job file"
