@@ -6,6 +6,7 @@ import os
 import select
 import time
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 from rsltrace.debug.checkpoints import COUNT_MAX, Checkpoint, Checkpoints
@@ -19,7 +20,7 @@ _PAUSE_LIMIT_S = 5.0
 _LOOK_S = 0.2
 """A wait counts for no more than that: a machine that stands still is no callback that hangs."""
 _NEARLY = 0.8
-_PIECE_BYTES = 1 << 16
+_PIPE_BYTES = 1 << 16
 
 
 class ClientGoneError(DebugError):
@@ -410,14 +411,14 @@ class CheckpointTree:
         began_s = time.monotonic()
         ready = select.select(ends, [], [], _LOOK_S if is_paused else limit_s)[0]
         is_over = not ready
+        if self._output in ready:
+            self._pass_output_on()
         if is_paused:
             self._left_s -= min(time.monotonic() - began_s, _LOOK_S)
             is_over = self._left_s <= 0
         if is_over:
             self._left_s = 0.0
             raise Lost("its callback did not come back, and was ended")
-        if self._output in ready:
-            self._pass_output_on()
         if self._client in ready:
             self._read_client(process)
         if process is not None and process.lines in ready:
@@ -438,12 +439,10 @@ class CheckpointTree:
             raise ClientGoneError("the client is gone")
 
     def _pass_output_on(self) -> None:
-        """Send what nodes have printed to the client."""
-        while True:
-            try:
-                data = os.read(self._output, _PIECE_BYTES)
-            except BlockingIOError:
-                return
+        """Send what nodes have printed to the client: once what the pipe holds, as a node that
+        prints without end would not let the client stop it."""
+        with suppress(BlockingIOError):
+            data = os.read(self._output, _PIPE_BYTES)
             if not self._is_quiet:
                 self._tell({"notice": "output", "text": data.decode("utf-8", "replace")})
 

@@ -438,8 +438,9 @@ def test_a_machine_that_stands_still_does_not_hide_how_a_process_ended() -> None
     assert done.stdout == "its process was killed by SIGKILL\n", done.stderr
 
 
+@pytest.mark.parametrize("prints_endlessly", [False, True])
 def test_a_machine_that_stands_still_does_not_end_a_callback(
-    monkeypatch: pytest.MonkeyPatch,
+    prints_endlessly: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tree, "Family", MagicMock)
     monkeypatch.setattr(tree, "_PAUSE_LIMIT_S", 0.25)
@@ -451,6 +452,9 @@ def test_a_machine_that_stands_still_does_not_end_a_callback(
         made = tree.CheckpointTree({"checkpoints": 1, "memory_mib": 1}, Lines(asked), deque())
         stack.callback(os.close, made._output)
         stack.callback(os.close, made._output_end)
+        if prints_endlessly:
+            stack.callback(os.close, endless := os.open("/dev/zero", os.O_RDONLY))
+            made._output, made._is_quiet = endless, True
         simulation = SimProcess(Lines(process), 0)
         client.sendall(b'{"do": "pause"}\n')
         made._wait_for(simulation, None)
