@@ -352,7 +352,7 @@ class NativeRun:
     def close(
         self,
         ended_after: int,
-        stuck: tuple[str, ...],
+        stuck: Mapping[str, str],
         unreadable: int,
         *,
         callbacks_ns: int,
@@ -360,7 +360,7 @@ class NativeRun:
     ) -> NativeResult:
         """Write what is left, close the trace, and say how it went. Processor time: that of
         callbacks with rclpy and the middleware (and what observes them in their threads), and that
-        of reporting it beside them.
+        of reporting it beside them. ``stuck`` are entries, and where their callbacks are.
 
         :raises OutputError: if the trace cannot be written.
         """
@@ -384,7 +384,7 @@ class NativeRun:
             pen_ns=pen_ns,
             callback_ns=callback_ns,
             error=self.error,
-            stuck=stuck,
+            stuck=tuple(stuck),
             notes=(*self.notes, *_said(stuck, unreadable)),
             kept=self.writer.kept,
             failed_checks={} if checks is None else checks.failed,
@@ -397,9 +397,9 @@ class NativeRun:
         return {"thread_priorities": ", ".join(f"{name} {level}" for name, level in levels)}
 
 
-def _said(stuck: tuple[str, ...], unreadable: int) -> Iterator[str]:
-    for name in stuck:
-        yield f"a callback of {name} did not return within {ENDS_WITHIN_S:g} s of the end"
+def _said(stuck: Mapping[str, str], unreadable: int) -> Iterator[str]:
+    for name, place in stuck.items():
+        yield f"a callback of {name} did not return within {ENDS_WITHIN_S:g} s of the end{place}"
     if unreadable:
         yield f"{unreadable} messages could not be read as bytes: no hash of them"
 

@@ -75,6 +75,15 @@ class RunningEntry(threading.Thread):
         """What went wrong if it raised, in words."""
         return f"{'a callback of' if self.nodes else 'constructing'} {self.entry.name}"
 
+    @property
+    def busy(self) -> int | None:
+        """The thread in which a callback runs: its own, or one of a multi-threaded executor."""
+        if self.is_alive():
+            return self.ident
+        pool = getattr(getattr(self._executor, "_executor", None), "_threads", ())
+        running = self._recorder.stacks
+        return next((one.ident for one in pool if running.get(one.ident)), None)
+
     def _construct(self) -> None:
         recorder = self._recorder
         recorder.begin(int(EventKind.CONSTRUCT), None)

@@ -32,6 +32,7 @@ from rsltrace.native.support import domain
 from rsltrace.run.inputs import expand_launch_files
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import RunCallbacks, preserved_process, search_path
+from rsltrace.run.watchdog import place_of
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.failure import exception_text, user_traceback
 
@@ -157,10 +158,12 @@ class SingleProcessRun(NativeRun):
         deadline = time.monotonic() + ENDS_WITHIN_S
         for one in self._running:
             one.join(max(deadline - time.monotonic(), 0.1))
-        stuck = tuple(one.entry.name for one in self._running if one.is_alive())
+            while one.busy and time.monotonic() < deadline:
+                time.sleep(LOOK_EVERY_S)
+        stuck = {one.entry.name: place_of(one.busy) for one in self._running if one.busy}
         ended_after = self.recorder.count
         for one in self._running:
-            if not one.is_alive() and self.error is None:
+            if not one.busy and self.error is None:
                 destroy(one.nodes, self.recorder, self.entities)
         if self.priorities is not None:
             self.levels.update(self.priorities.levels)

@@ -160,6 +160,8 @@ class SpanRecorder:
         self._spans: deque[CallbackSpan] = deque()
         self._local = threading.local()
         self._threads = 0
+        self.stacks: dict[int, list[RunningCallback]] = {}
+        """What runs in each thread, the innermost callback last."""
         self.count = 0
         """How many spans are over."""
         self.activity_ns = 0
@@ -297,7 +299,7 @@ class SpanRecorder:
         try:
             stack: list[RunningCallback] = self._local.stack
         except AttributeError:
-            stack = self._local.stack = []
+            stack = self._local.stack = self.stacks[threading.get_ident()] = []
             with self._lock:
                 self._threads += 1
                 self._local.thread = self._threads

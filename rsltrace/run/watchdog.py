@@ -16,7 +16,7 @@ import os
 import sys
 from _thread import allocate_lock, start_new_thread
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import islice
 from types import FrameType
@@ -102,6 +102,9 @@ class Watchdog:
                 ending += 1
                 if ending >= _LOOKS_BEFORE_END and not self._is_handling_error():
                     self.signal = 0  # once
+                    if not self.has_warned:
+                        with suppress(Exception):
+                            self._tell(int(still * LOOK_EVERY_S))
                     # Not as a signal: ``timeout`` has sent two, and the third would kill.
                     _raise_in(ctypes.c_ulong(self._thread), ctypes.py_object(KeyboardInterrupt))
             since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
@@ -128,9 +131,7 @@ class Watchdog:
         in_event = any(frame.f_code in _CALLS for frame in frames)
         handle = domain.event.handle if in_event else None
         who = "the run, outside of any callback," if handle is None else handle.describe()
-        place = next((f for f in frames if is_user_file(f.f_code.co_filename)), None)
-        place = place or next(iter(frames), None)
-        where = f", {_place(place)}" if place is not None else ""
+        where = _place(frames)
         if process := _process_asked(frames):
             who, where = f"{process}, in {who},", ""
         tell(
@@ -159,5 +160,12 @@ def _process_asked(frames: Iterable[FrameType]) -> str:
     return "" if asked is None else f"process {asked.name} (pid {asked.child.pid})"
 
 
-def _place(frame: FrameType) -> str:
-    return f"now at {frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_name}"
+def place_of(thread: int | None) -> str:
+    """Say at which line of the user's code a thread is, to follow a sentence."""
+    return _place(list(_frames(sys._current_frames().get(thread or 0))))
+
+
+def _place(frames: Sequence[FrameType]) -> str:
+    for frame in [*(f for f in frames if is_user_file(f.f_code.co_filename)), *frames[:1]]:
+        return f", now at {frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_name}"
+    return ""

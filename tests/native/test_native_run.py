@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import signal
 import subprocess
 from collections import Counter
@@ -242,10 +243,12 @@ def test_a_node_that_raises_ends_the_run(tmp_path: Path) -> None:
         assert trace.result["exit_code"] == "3"
 
 
-def test_ctrl_c_ends_it_properly_even_if_a_callback_is_stuck(tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["single", "multi", "processes"])
+def test_ctrl_c_ends_it_properly_even_if_a_callback_is_stuck(tmp_path: Path, how: str) -> None:
     path = job(tmp_path, "nodes: [{node: robot:Stuck}, {node: robot:Talker}]\n")
+    options = ["--processes"] if how == "processes" else ["--executor", how]
     process = subprocess.Popen(
-        [*COMMAND, "record", "--native", str(path), "-o", "run.mcap"],
+        [*COMMAND, "record", "--native", *options, str(path), "-o", "run.mcap"],
         cwd=tmp_path,
         env={**environment(tmp_path), "STUCK": "stuck"},
         stderr=subprocess.PIPE,
@@ -260,6 +263,7 @@ def test_ctrl_c_ends_it_properly_even_if_a_callback_is_stuck(tmp_path: Path) -> 
         process.wait()
     assert process.returncode == 130
     assert "a callback of robot:Stuck did not return" in said
+    assert re.search(r"robot\.py:\d+ in on_timer$", said, re.MULTILINE), said
     with Trace.open(tmp_path / "run.mcap") as trace:
         trace.check()
         assert trace.result["stop_reason"] == "interrupted"

@@ -174,9 +174,9 @@ def _parse(name: str) -> YamlSource:
 
 def _not_there(path: Path) -> str:
     """Say that a file is missing, and which one of its folder was probably meant."""
-    kind, suffixes = "job file", (".yaml", ".yml", ".json")
-    if path.suffix == ".mcap":  # of a command that takes traces and jobs
-        kind, suffixes = "trace", (".mcap",)
+    is_trace = path.suffix == ".mcap"  # for a command that takes traces and jobs
+    kind = "trace" if is_trace else "job file"
+    suffixes = (".mcap",) if is_trace else (".yaml", ".yml", ".json")
     files = {}
     with suppress(OSError):
         files = {f.stem: f.name for f in sorted(path.parent.iterdir()) if f.suffix in suffixes}

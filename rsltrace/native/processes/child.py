@@ -270,9 +270,12 @@ class _EntryProcess:
         if self._entry is not None:
             self._entry.stop()
         if not self._is_over.wait(ENDS_WITHIN_S):
+            from rsltrace.run.watchdog import place_of
+
+            place = place_of(threading.main_thread().ident)
             self._finish()
             with suppress(OSError):
-                self._link.send("stuck")
+                self._link.send("stuck", place)
             os._exit(0)
 
     def _forked(self) -> None:

@@ -67,7 +67,7 @@ class ObservedProcess(threading.Thread):
         self.has_told_all = False
         self.forks = 0
         self.is_stopping = False
-        self.is_stuck = False
+        self.is_stuck, self.stuck_at = False, ""
         self.exit_text = ""
         self._told = told
         self._ended = ended

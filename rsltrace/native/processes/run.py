@@ -329,7 +329,7 @@ class MultiProcessRun(NativeRun):
         elif what == "levels":
             self.levels.update(values[0])
         elif what == "stuck":
-            child.is_stuck = True
+            child.is_stuck, child.stuck_at = True, str(values[0])
         else:
             raise ValueError(f"an unknown frame, {what!r}")
 
@@ -570,7 +570,7 @@ class MultiProcessRun(NativeRun):
                 "processes that stood still, and are later in the trace than they were"
             )
         self.notes += missed_starts(self.job, self.starts.missed())
-        stuck = tuple(child.what.name for child in self.children if child.is_stuck)
+        stuck = {c.what.name: c.stuck_at for c in self.children if c.is_stuck}
         unreadable, cpu_ns, beside_ns = (
             sum(one[place] for one in self._counts.values()) for place in (2, 3, 4)
         )
