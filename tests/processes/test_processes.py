@@ -220,7 +220,8 @@ def test_a_process_that_fails_ends_the_run_and_is_named_with_its_last_callback(
 def test_a_deadlock_is_noted_once(counter: Path, tmp_path: Path) -> None:
     """The signal at the end of the run wakes the process, which then waits for the same again."""
     result = run(_job(tmp_path, counter, "'100'", "lock"), tmp_path / "t.mcap")
-    assert sum("deadlock, unless a signal comes" in note for note in result.notes) == 1
+    (note,) = (note for note in result.notes if "deadlock, unless a signal comes" in note)
+    assert re.search(r"^ +.*counter\.c:\d+ in main$", note, re.MULTILINE), note
 
 
 def test_a_class_that_rosidl_did_not_generate_is_named(

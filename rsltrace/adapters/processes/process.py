@@ -21,7 +21,7 @@ from rsltrace.adapters.processes.process_entities import (
     ProcessEntities,
     WakingTimer,
 )
-from rsltrace.adapters.processes.source_lines import stack_text
+from rsltrace.adapters.processes.source_lines import report_text, stack_text
 from rsltrace.adapters.processes.wire import (
     GO,
     GRAPH_ID,
@@ -505,7 +505,8 @@ class Process:
         self.adapter.log(fields.number(), fields.text(), fields.text())
 
     def _report(self, fields: RecordReader) -> None:
-        notes, note = self.adapter.domain.outcome.notes, f"process {self.name}: {fields.text()}"
+        notes = self.adapter.domain.outcome.notes
+        note = f"process {self.name}: {report_text(fields.text())}"
         if note not in notes:  # it waits for the same again after the signal that ends the run
             notes.append(note)
 

@@ -46,6 +46,23 @@ def stack_text(packed: bytes) -> str:
     return f"{Path(module).name}+{address:#x}"
 
 
+_FRAME = re.compile(r"^( +)(.* \()?(/.+)\+(0x[0-9a-f]+)(\)?)$", re.MULTILINE)
+
+
+def report_text(report: str) -> str:
+    """Return a report on threads in which lines of source code, where they are known, take the
+    place of the addresses in their stacks."""
+    _lines_of([(module, int(address, 16)) for _, _, module, address, _ in _FRAME.findall(report)])
+
+    def lines(frame: re.Match[str]) -> str:
+        begin, name, module, address, end = frame.groups(default="")
+        found = _lines[module, int(address, 16)]
+        found = found or [f"{name}{Path(module).name}+{address}{end}"]
+        return "\n".join(f"{begin}{line}" for line in found)
+
+    return _FRAME.sub(lines, report)
+
+
 _lines: dict[Frame, list[str]] = {}
 """The lines at each address: the inlined function first."""
 

@@ -20,16 +20,16 @@ std::string hex(std::uintptr_t value) {
   return text;
 }
 
-std::string module(const Dl_info &info, std::uintptr_t address) {
+std::string module(const Dl_info &info, std::uintptr_t address, bool code) {
   const std::string path = info.dli_fname == nullptr ? "?" : info.dli_fname;
-  return path.substr(path.rfind('/') + 1) + "+" + hex(address - reinterpret_cast<std::uintptr_t>(info.dli_fbase));
+  return (code ? path : path.substr(path.rfind('/') + 1)) + "+" + hex(address - reinterpret_cast<std::uintptr_t>(info.dli_fbase));
 }
 
-// "name" of what is there if it is exported, else "module+offset" (for addr2line).
+// "name" of what is there if it is exported, else "module+offset", of code with the module's path: the run finds its line.
 std::string symbol(const void *where, bool code) {
   Dl_info info{};
   if (dladdr(where, &info) == 0) return hex(reinterpret_cast<std::uintptr_t>(where));
-  const std::string place = module(info, reinterpret_cast<std::uintptr_t>(where));
+  const std::string place = module(info, reinterpret_cast<std::uintptr_t>(where), code);
   if (info.dli_sname == nullptr) return place;
   int status = 0;
   const std::unique_ptr<char, void (*)(void *)> name(
