@@ -181,9 +181,9 @@ def replay(
     with prepare_replay(trace, job_folder, bags=not nodes) as plan:
         if no_pin or not plan.job.guard.pins:
             unpin()
-        count = None if until is None else event_count_to(plan.trace, until)
+        count = None if until is None else event_count_to(plan.trace, until, "--until")
         check_edits(changes, plan.trace)
-        begin = 0 if first is None else max(event_count_to(plan.trace, first) - 1, 0)
+        begin = 0 if first is None else max(event_count_to(plan.trace, first, "--from") - 1, 0)
         if not as_json:
             for line in code_lines(plan, "replaying", node or None):
                 tell(line)

@@ -18,7 +18,13 @@ if TYPE_CHECKING:
     from rsltrace.job.parts.record import HooksSpec, RecordSpec
     from rsltrace.job.parts.stop import StopSpec, TopicStop
     from rsltrace.job.parts.vary import VarySpec
-    from rsltrace.job.reading.load import job_from_text, load_job, locate, showing_line
+    from rsltrace.job.reading.load import (
+        job_from_text,
+        load_job,
+        locate,
+        message_at,
+        showing_line,
+    )
 
 _HOMES = {
     "BagSpec": "parts.bag",
@@ -38,6 +44,7 @@ _HOMES = {
     "job_from_text": "reading.load",
     "load_job": "reading.load",
     "locate": "reading.load",
+    "message_at": "reading.load",
     "showing_line": "reading.load",
     "VarySpec": "parts.vary",
     "policy_of": "parts.guard",
@@ -62,6 +69,7 @@ __all__ = [
     "job_from_text",
     "load_job",
     "locate",
+    "message_at",
     "policy_of",
     "showing_line",
 ]

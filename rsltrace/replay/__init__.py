@@ -140,7 +140,7 @@ def replay_trace(
             return replay_native(plan, to=to)
         return replay_prepared(
             plan,
-            until=None if until is None else event_count_to(plan.trace, until),
+            until=None if until is None else event_count_to(plan.trace, until, "until"),
             to=to,
             edits=[parse_edit(edit) for edit in ([edits] if isinstance(edits, str) else edits)],
         )

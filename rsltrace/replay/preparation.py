@@ -426,8 +426,8 @@ class ReplayOutput:
 NOT_KEPT = ReplayOutput()
 
 
-def event_count_to(trace: Trace, position: Position) -> int:
-    """Return the number of events up to and including a position.
+def event_count_to(trace: Trace, position: Position, option: str) -> int:
+    """Return the number of events up to and including a position, which ``option`` gives.
 
     :raises ReplayError: it is not a position, or before the first event.
     """
@@ -440,7 +440,8 @@ def event_count_to(trace: Trace, position: Position) -> int:
         time_ns = parse_time_in_run(text).stamp_ns(trace.start_ns, trace.end_ns)
     except ValueError as error:
         raise ReplayError(
-            f"{text!r} is neither the index of an event (812) nor a time (60s, 2.5): {error}"
+            f"{option}: {text!r} is neither the index of an event (812) nor a time (60s, 2.5): "
+            f"{error}"
         ) from None
     count = 0
     for rows in trace.events():

@@ -245,6 +245,7 @@ def test_wrong_ros_arguments(rsltrace: Command) -> None:
         (["-p", "rate=1"], "ROS arguments are written -p [NODE:]NAME:=VALUE"),
         (["--params-file", "none.yaml"], "none.yaml"),
         (["--bogus"], "unknown ROS arguments"),
+        (["--", "--set", "ros_arguments=[-p, rate]"], "      | ros_arguments=[-p, rate]\n"),
     ]:
         done = rsltrace("record", "job.yaml", "--ros-args", *words)
         assert done.returncode == 2

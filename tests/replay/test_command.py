@@ -70,6 +70,8 @@ def test_until_keeps_a_prefix(command: Callable[..., Any]) -> None:
 def test_positions_that_are_none(command: Callable[..., Any]) -> None:
     with pytest.raises(ReplayError, match="neither the index of an event"):
         rsltrace.replay("run.mcap", until="soon")
+    for option in ("--until", "--from"):
+        assert f"error: {option}: 'soon' is neither the index" in command(option, "soon").stderr
     assert command("--until", "1000000").stdout.startswith("verified all ")
 
 

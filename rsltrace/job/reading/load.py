@@ -258,6 +258,13 @@ def locate(job: Job, loc: tuple[str | int, ...]) -> str:
     return place.source.where(place.mark)
 
 
+def message_at(job: Job, loc: tuple[str | int, ...], message: str) -> str:
+    """Return a message on the part at ``loc``, between where that stands and its line."""
+    place = _place(job, loc)
+    line = "" if place is None else place.source.excerpt(place.mark)
+    return f"{locate(job, loc)}: {message}{line}"
+
+
 @contextmanager
 def showing_line(job: Job, loc: tuple[str | int, ...]) -> Iterator[None]:
     """Add the line of the job to a ``JobError`` that is raised about the part at ``loc``."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import BagError, SetupError
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.job import Job, locate
+from rsltrace.job import Job, locate, message_at
 from rsltrace.job.values.names import check_topic
 from rsltrace.run.plans.faults import BagFaults, check_changes
 from rsltrace.run.stop_rules import end_ns_of, has_stop
@@ -75,7 +75,7 @@ def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
         loc: tuple[str | int, ...] = ("bags", index, "path")
         if error.glob in spec.topics:
             loc = ("bags", index, "topics", spec.topics.index(error.glob or ""))
-        raise BagError(f"{locate(job, loc)}: {error}") from error
+        raise BagError(message_at(job, loc, str(error))) from error
     with opened as bag:
         _check_names(job, index, bag)
         yield BagInput(
@@ -104,10 +104,8 @@ def _check_names(job: Job, index: int, bag: Bag) -> None:
     for key, globs in (("remappings", spec.remappings), ("qos", spec.qos)):
         for glob in globs:
             if not any(fnmatchcase(name, glob) for name in names):
-                raise BagError(
-                    f"{locate(job, ('bags', index, key, glob))}: {spec.path} plays no topic "
-                    f"{glob!r}: it plays {', '.join(names)}"
-                )
+                text = f"{spec.path} plays no topic {glob!r}: it plays {', '.join(names)}"
+                raise BagError(message_at(job, ("bags", index, key, glob), text))
 
 
 def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:

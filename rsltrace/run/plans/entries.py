@@ -483,6 +483,11 @@ def arguments_for_all(job: Job) -> list[str]:
 
     :raises JobError: rcl refuses them.
     """
+    with showing_line(job, ("ros_arguments",)):
+        return _arguments_for_all(job)
+
+
+def _arguments_for_all(job: Job) -> list[str]:
     words = list(job.ros_arguments)
     for index, word in enumerate(words[:-1]):
         if word == "--params-file":
