@@ -148,12 +148,19 @@ def test_the_page_needs_nothing_beside_it_and_nobodys_text_is_markup() -> None:
     assert "error [m]" in seen.text
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_a_page_of_next_to_nothing(count: int) -> None:
-    seen = _Balanced()
-    seen.feed(exploration_page(Exploration(JobSource("job.yaml"), explored(count).results)))
+@pytest.mark.parametrize(
+    ("count", "numbers", "failed"),
+    [
+        (0, ("0runs", "0different digests"), "None of the 0 runs failed"),
+        (1, ("1run", "1different digest"), "The run did not fail"),
+    ],
+)
+def test_a_page_of_next_to_nothing(count: int, numbers: tuple[str, ...], failed: str) -> None:
+    seen, results = _Balanced(), explored(count).results
+    seen.feed(exploration_page(Exploration(JobSource("job.yaml"), results, wall_s=13.4734)))
     assert seen.open == []
-    assert f"None of the {count} runs failed" in seen.text
+    for said in (*numbers, "13.5 sof real time", failed):
+        assert re.search(rf"{said}(?!s)", seen.text), seen.text
 
 
 @pytest.mark.long

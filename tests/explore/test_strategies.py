@@ -66,6 +66,13 @@ def test_where_there_is_no_choice_feedback_draws_anew() -> None:
     assert len(seeds) == 8
 
 
+def test_of_one_choice_there_is_a_singular() -> None:
+    strategy = strategy_named("pct", JOB)
+    strategy.begin(result(0, {}, 1, ((0, 2),)))
+    strategy.propose(0)
+    assert strategy.coverage()[0].endswith("by these 1 (3 entities, 1 choice)")
+
+
 @pytest.mark.long
 def test_pct_meets_planted_orders_no_less_often_than_its_bound() -> None:
     script = Path(__file__).resolve().parents[2] / "benchmarks" / "explore_pct.py"

@@ -71,6 +71,11 @@ def format_duration(duration_ns: float, digits: int = _DIGITS, *, signed: bool =
     return f"{round(rounded):{sign}d} ns"
 
 
+def counted(count: int, what: str) -> str:
+    """Return a number of things."""
+    return f"{count:,} {what}{'s' * (count != 1)}"
+
+
 def format_milliseconds(duration_ns: int | None) -> str:
     """Return a duration for a column in milliseconds."""
     if duration_ns is None:

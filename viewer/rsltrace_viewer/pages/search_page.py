@@ -25,7 +25,7 @@ from rsltrace.search.explore.report import (
     view_command,
 )
 from rsltrace.search.explore.trial import TrialResult
-from rsltrace.trace.model.texts import format_duration, shortened
+from rsltrace.trace.model.texts import counted, shortened
 from rsltrace_viewer.pages.charts import histogram, number, progress, scatter
 from rsltrace_viewer.pages.diff_page import part_of
 from rsltrace_viewer.pages.page import render_page
@@ -50,11 +50,11 @@ def exploration_page(explored: Exploration) -> str:
     runs = len(explored.results)
     rate = runs / explored.wall_s if explored.wall_s > 0 else 0.0
     numbers = (
-        (f"{runs:,}", "runs"),
+        counted(runs, "run").split(" ", 1),
         (f"{len(explored.failed):,}", "failed"),
-        (f"{len(causes(explored)):,}", "causes"),
-        (f"{explored.digests:,}", "different digests"),
-        (format_duration(round(explored.wall_s * 1e9)), "of real time"),
+        counted(len(causes(explored)), "cause").split(" ", 1),
+        counted(explored.digests, "different digest").split(" ", 1),
+        (f"{explored.wall_s:,.1f} s", "of real time"),
         (f"{rate:.1f}", "runs per second"),
         (explored.strategy or "-", "strategy"),
     )

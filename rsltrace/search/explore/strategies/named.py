@@ -23,6 +23,7 @@ from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
 from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.policy import pct_bound
 from rsltrace.trace.chain import hash64
+from rsltrace.trace.model.texts import counted
 
 # The settings of each run of a job with ``vary:``, by its number.
 
@@ -173,7 +174,7 @@ class Feedback(Strategy):
             overlay = self._near(chance)
             if self._is_new(overlay):
                 break
-        words = f"near what was new, {len(overlay['policy']['departures'])} departures"
+        words = f"near what was new, {counted(len(overlay['policy']['departures']), 'departure')}"
         if "seed" in overlay:
             words += f", seed {overlay['seed']}"
         return Proposal(overlay, words)
@@ -226,8 +227,8 @@ class Feedback(Strategy):
 
     def coverage(self) -> list[str]:
         return [
-            f"feedback: {self._new_runs} of {self._runs} runs showed something new, "
-            f"{len(self._seen)} behaviours in all"
+            f"feedback: {self._new_runs} of {counted(self._runs, 'run')} showed something new, "
+            f"{counted(len(self._seen), 'behaviour')} in all"
         ]
 
 
@@ -269,7 +270,7 @@ class RandomWalk(_ByNumber):
         return self._proposal({"order": "permutation"}, number, "random order")
 
     def coverage(self) -> list[str]:
-        return [f"random walk: {self._tried} seeds"] if self._tried else []
+        return [f"random walk: {counted(self._tried, 'seed')}"] if self._tried else []
 
     def recall(self, result: TrialResult) -> None:
         policy = result.trial.overlay.get("policy")
@@ -310,7 +311,8 @@ class PctWalk(_ByNumber):
                 lines.append(
                     f"PCT: a bug of depth {depth} is found with a probability of at least "
                     f"{bound:.2g} by one run, {least:.2g} by these {runs} "
-                    f"({self._entities} entities, {self._choices} choices)"
+                    f"({self._entities} {'entity' if self._entities == 1 else 'entities'}, "
+                    f"{counted(self._choices, 'choice')})"
                 )
         return lines
 
