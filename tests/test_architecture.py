@@ -457,7 +457,7 @@ WRITES = {
     "rsltrace/adapters/launch/expand.py": "open rename write_bytes",
     "rsltrace/adapters/launch/ros_launch.py": "unlink",
     "rsltrace/adapters/processes/build.py": "rmtree write_text",
-    "rsltrace/adapters/workspace/cache.py": "mkdir rename rmtree",
+    "rsltrace/adapters/workspace/cache.py": "mkdir open rename rmtree unlink",
     "rsltrace/adapters/workspace/generate.py": "mkdir os.replace rmtree write_bytes write_text",
     "rsltrace/adapters/workspace/installs.py": "mkdir symlink_to touch",
     "rsltrace/adapters/workspace/interfaces.py": "mkdir touch write_text",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -141,6 +143,48 @@ def test_a_cache_that_others_can_change_is_left_alone(caches: Path) -> None:
     caches.chmod(0o777)
     made = cache.cached_folder("things", "a", lambda folder: None)
     assert caches not in made.parents
+
+
+def test_one_fills_a_folder_and_others_wait(caches: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    filling, another, made = threading.Event(), threading.Event(), []
+    lock = fcntl.flock
+
+    def asked(file: int, what: int) -> None:
+        if filling.is_set():
+            another.set()
+        lock(file, what)
+
+    def make(folder: Path) -> None:
+        made.append(folder)
+        if filling.is_set():
+            another.set()
+        filling.set()
+        assert another.wait(600)
+
+    monkeypatch.setattr(fcntl, "flock", asked)
+    first = threading.Thread(target=cache.cached_folder, args=("things", "a", make))
+    first.start()
+    assert filling.wait(600)
+    found = cache.cached_folder("things", "a", make)
+    first.join()
+    assert len(made) == 1
+    assert list(found.parent.iterdir()) == [found], "the lock is left"
+
+
+FILLS = """
+import time
+from rsltrace.adapters.workspace.cache import cached_folder
+cached_folder("things", "a", lambda folder: print("begun", flush=True) or time.sleep(600))
+"""
+
+
+def test_a_killed_process_fills_no_folder_and_keeps_nobody_waiting(caches: Path) -> None:
+    command = [sys.executable, "-c", FILLS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"begun\n"
+        process.kill()
+    assert cache.cached_folder("things", "a", lambda folder: None).is_dir()
 
 
 @pytest.mark.parametrize(

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
 from rsltrace.errors import SetupError
 
 _NEW = ".new-"
+_LOCK = ".lock-"
 _PLACE = "RSLTRACE_CACHE"
 _LEFT_S = 3600.0
 
@@ -32,7 +34,8 @@ def key_of(parts: Iterable[str | bytes]) -> str:
 def cached_folder(kind: str, name: str, make: Callable[[Path], None]) -> Path:
     """Return the folder ``kind/name`` of the cache; if it is not there, ``make`` fills it.
 
-    Runs that are made at the same time may both fill one: the first to be ready counts.
+    Runs that begin at the same time wait for the one that fills it. Where files cannot be locked,
+    each of them may: the first to be ready counts.
 
     :raises SetupError: if others can write there: what is in it may be run.
     """
@@ -46,6 +49,30 @@ def cached_folder(kind: str, name: str, make: Callable[[Path], None]) -> Path:
     if place.is_dir():
         return place
     place.parent.mkdir(0o755, parents=True, exist_ok=True)
+    with _locked(place.parent / f"{_LOCK}{name}"):
+        if not place.is_dir():
+            _fill(place, make)
+    return place
+
+
+@contextmanager
+def _locked(file: Path) -> Iterator[None]:
+    """Lock a file as long as the ``with`` block lasts; the kernel unlocks that of a killed process.
+
+    It is removed: whoever still waits for it finds the folder that was made, or makes it."""
+    lock = os.open(file, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        file.unlink(missing_ok=True)
+        with suppress(OSError):
+            fcntl.flock(lock, fcntl.LOCK_UN)  # a fork may have it open, too
+        os.close(lock)
+
+
+def _fill(place: Path, make: Callable[[Path], None]) -> None:
     _clear_leftovers(place.parent)
     made = Path(tempfile.mkdtemp(dir=place.parent, prefix=_NEW))
     try:
@@ -58,7 +85,6 @@ def cached_folder(kind: str, name: str, make: Callable[[Path], None]) -> Path:
                 raise
     finally:
         shutil.rmtree(made, ignore_errors=True)
-    return place
 
 
 def _clear_leftovers(folder: Path) -> None:
