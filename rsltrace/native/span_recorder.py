@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import FrameType
 
@@ -165,10 +166,15 @@ class SpanRecorder:
         self.activity_ns = 0
         """When something was last sent, steady."""
         self.until_ns = 0
+        self.main: RunningCallback | None = None
+        """The main of this process."""
+        self.after_each: Callable[[], object] | None = None
+        """Called after what a callback or a thread has sent, logged or made, and after its end."""
 
     def unlock(self) -> None:
         """Go on in a forked process, where no other thread gives the lock back."""
         self._lock = threading.Lock()
+        self.after_each = None
 
     def now_ns(self) -> int:
         """Read the steady clock."""
@@ -223,6 +229,8 @@ class SpanRecorder:
                 callback.span.flags |= _RAISED if failure is not None else 0
                 self._close(callback.span)
                 callback.span = None
+        if self.after_each is not None:
+            self.after_each()
 
     def add(self, output: Output, begun_ns: int = 0) -> tuple[CallbackSpan, int]:
         """Add an output of what runs in this thread; return where it is.
@@ -238,7 +246,10 @@ class SpanRecorder:
             span.outputs.append(output)
             if begun_ns:
                 span.observer_ns += self.now_ns() - begun_ns
-            return span, len(span.outputs) - 1
+            place = len(span.outputs) - 1
+        if self.after_each is not None:
+            self.after_each()
+        return span, place
 
     def sending(self) -> CallbackSpan:
         """Return the event that is about to send something, which has begun then: whoever gets it
@@ -260,6 +271,8 @@ class SpanRecorder:
                     span.observer_ns += self.now_ns() - begun_ns
             if span.owner is None:
                 self._close(span)
+        if self.after_each is not None:
+            self.after_each()
 
     def current(self) -> RunningCallback | None:
         """Return the callback that runs in this thread."""
@@ -303,11 +316,17 @@ class SpanRecorder:
                 self._local.thread = self._threads
         return stack
 
-    def pause(self, entity: ObservedEntity) -> None:
-        """Note that a main waits: what comes of it afterwards is another event."""
+    def pause(self, entity: ObservedEntity | None = None) -> None:
+        """Note that what runs in this thread waits, or only a main: what comes of it afterwards is
+        another event."""
         stack = self._stack()
-        if stack and stack[-1].entity is entity:
+        if stack and entity in (None, stack[-1].entity):
             self._suspend(stack[-1])
+
+    def pause_main(self) -> None:
+        """Note from any thread that what comes of the main from now on is another event."""
+        if self.main is not None:
+            self._suspend(self.main)
 
     def _under_way(self, stack: list[RunningCallback]) -> CallbackSpan:
         """Return what runs in this thread, which begins now if nothing has come of it so far."""

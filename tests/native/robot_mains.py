@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from itertools import count as count_from
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,45 @@ def crash() -> None:
     while not heard:
         rclpy.spin_once(node)
     os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def crash_at_end() -> None:
+    """Publish numbers that begin with an argument, and be killed as it ends: after ``spin``, in
+    ``destroy`` of its node after another number, or in the ``shutdown`` that it calls itself. A
+    file says what it has published."""
+    name, where = sys.argv[1:]
+    numbers, sent = count_from(int(name) * 100_000), []
+
+    class Crashing(Node):
+        def destroy_node(self) -> None:
+            end()
+
+    def publish() -> None:
+        out.publish(UInt64(data=(number := next(numbers))))
+        sent.append(number)
+        if len(sent) == ENOUGH:
+            Path(f"{name}.heard").touch()
+            if where == "shutdown":
+                rclpy.get_default_context().on_shutdown(end)
+                rclpy.shutdown()
+
+    def end() -> None:
+        Path(name).write_text(json.dumps(sent))
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+    # rclpy's handlers shut down, and publishing fails from then on.
+    rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    node = Crashing(f"crash_{name}")
+    out = node.create_publisher(UInt64, "/numbers", DEPTH)
+    node.create_timer(0.001, publish)
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    if where == "destroy":
+        publish()
+        node.destroy_node()
+    end()
 
 
 def fork() -> None:

@@ -360,6 +360,27 @@ def test_a_process_that_fails_is_named_and_the_trace_is_kept(
             assert words in {output.entity for output in outputs if output.kind == 1}
 
 
+@pytest.mark.parametrize("where", ["spin", "destroy", "shutdown"])
+def test_all_that_a_main_has_done_that_crashes_at_its_end_is_kept(
+    where: str, tmp_path: Path
+) -> None:
+    nodes = [
+        f"  - {{main: robot_mains:crash_at_end, arguments: [{n}, {where}], on_exception: log}}\n"
+        for n in range(1, 5)
+    ]
+    stop = "stop: {function: robot_mains:all_heard, timeout: 300s}\n"
+    done = record(tmp_path, f"nodes:\n{''.join(nodes)}{stop}")
+    assert done.returncode == 0, done.stderr
+    assert "was killed by SIGSEGV" in done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        sent = [trace.decode("/numbers", data).data for _, _, data in trace.messages("/numbers")]  # type: ignore[attr-defined]
+    for name in range(1, 5):
+        own = [number for number in sent if number // 100_000 == name]
+        counted = json.loads((tmp_path / str(name)).read_text())
+        assert [number for number in own if number in counted] == counted
+        assert len(own) - len(counted) in (0, 1)  # it may be interrupted before it has counted one
+
+
 def test_all_that_a_killed_program_has_done_is_kept(
     tmp_path: Path, command: Any, compiled: Callable[[str], Path]
 ) -> None:
