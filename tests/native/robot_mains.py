@@ -41,6 +41,7 @@ class Counting(Node):
         self.create_subscription(UInt64, "/numbers", self.on_number, DEPTH)
         self.create_subscription(String, "/same", self.on_same, DEPTH)
         self.create_timer(self.declare_parameter("period", 0.01).value, self.on_timer)
+        self.told = self.declare_parameter("told", "").value
 
     def on_timer(self) -> None:
         self.out.publish(UInt64(data=self.next))
@@ -58,9 +59,8 @@ class Counting(Node):
 
     def destroy_node(self) -> None:
         """Write down what it has counted, if it is to be told."""
-        told = self.declare_parameter("told", "").value
-        if told:
-            Path(told).write_text(json.dumps(self.counted()))
+        if self.told:
+            Path(self.told).write_text(json.dumps(self.counted()))
         super().destroy_node()
 
     def counted(self) -> dict[str, Any]:
@@ -77,15 +77,24 @@ def count() -> None:
         pass
     finally:
         Path(sys.argv[1]).write_text(json.dumps(node.counted()))
+        end(node)
+
+
+def end(node: Node) -> None:
+    """End properly: Fast DDS crashes now and then if a program ends while it has nodes."""
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 def talk() -> None:
     """Publish in a loop, without a spin."""
     rclpy.init()
-    publisher = Node("talk").create_publisher(UInt64, "/numbers", 100)
+    node = Node("talk")
+    publisher = node.create_publisher(UInt64, "/numbers", 100)
     for number in range(int(sys.argv[1])):
         publisher.publish(UInt64(data=number))
         time.sleep(0.05)
+    end(node)
 
 
 def crash() -> None:
@@ -142,11 +151,13 @@ def fork() -> None:
     """Fork, and be a node in both processes."""
     copy = os.fork()
     rclpy.init()
-    publisher = Node("fork").create_publisher(UInt64, "/numbers", 10)
+    node = Node("fork")
+    publisher = node.create_publisher(UInt64, "/numbers", 10)
     publisher.publish(UInt64(data=copy == 0))
     time.sleep(0.1)
     if copy:
         os.waitpid(copy, 0)
+    end(node)
 
 
 def become() -> None:

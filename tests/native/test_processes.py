@@ -290,7 +290,8 @@ def test_other_programs_of_a_launch_file_run_and_what_they_start_is_observed(
     tmp_path: Path, command: Any
 ) -> None:
     """The shell starts Python: the first of it is a node, the others are told to end by the end."""
-    node = f"{sys.executable} -c 'import robot_mains; robot_mains.talk()' 5"
+    others = "until test -s said && test -e trapped; do sleep 0.1; done"  # they have come so far
+    node = f"{others}; {sys.executable} -c 'import robot_mains; robot_mains.talk()' 5"
     (tmp_path / "a.launch.py").write_text(f"""
 from launch import LaunchDescription
 from launch.actions import ExecuteProcess, Shutdown
@@ -300,7 +301,7 @@ def generate_launch_description():
         ExecuteProcess(cmd=[{node!r}], shell=True, on_exit=Shutdown(),
                        additional_env={{"PYTHONPATH": {str(ROBOT)!r}}}),
         ExecuteProcess(cmd=["sh", "-c", 'echo "$1" > said; sleep 1000', "sh", "a  b"]),
-        ExecuteProcess(cmd=["sh", "-c", "trap '' INT; while true; do sleep 0.1; done"]),
+        ExecuteProcess(cmd=["sh", "-c", "trap '' INT; touch trapped; while :; do sleep 1; done"]),
     ])
 """)
     done = command("record", "--native", "--launch", "a.launch.py", "-o", "run.mcap")
