@@ -194,7 +194,7 @@ class SpanRecorder:
         """Note that a callback begins in this thread; what ran there is suspended."""
         stack = self._stack()
         if stack:
-            self._suspend(stack[-1])
+            self.cut(stack[-1])
         callback = RunningCallback(entity)
         stack.append(callback)
         with self._lock:
@@ -207,7 +207,7 @@ class SpanRecorder:
     def suspend(self) -> None:
         """Note that the callback awaits something, and goes on with ``resume``."""
         callback = self._stack().pop()
-        self._suspend(callback)
+        self.cut(callback)
 
     def resume(self, callback: RunningCallback) -> None:
         """Note that a callback goes on that awaited something.
@@ -216,21 +216,22 @@ class SpanRecorder:
         """
         stack = self._stack()
         if stack:
-            self._suspend(stack[-1])
+            self.cut(stack[-1])
         stack.append(callback)
 
     def end(self, failure: CallbackError | None = None) -> None:
         """Note that the callback that runs in this thread is over."""
         if failure is not None:
             self.add(failure)
-        with self.interrupts, self._lock:
-            callback = self._local.stack.pop()
-            if callback.span is not None:
-                callback.span.flags |= _RAISED if failure is not None else 0
-                self._close(callback.span)
-                callback.span = None
-        if self.after_each is not None:
-            self.after_each()
+        with self.interrupts:
+            with self._lock:
+                callback = self._local.stack.pop()
+                if callback.span is not None:
+                    callback.span.flags |= _RAISED if failure is not None else 0
+                    self._close(callback.span)
+                    callback.span = None
+            if self.after_each is not None:
+                self.after_each()
 
     def add(self, output: Output, begun_ns: int = 0) -> tuple[CallbackSpan, int]:
         """Add an output of what runs in this thread; return where it is.
@@ -321,12 +322,7 @@ class SpanRecorder:
         another event."""
         stack = self._stack()
         if stack and entity in (None, stack[-1].entity):
-            self._suspend(stack[-1])
-
-    def pause_main(self) -> None:
-        """Note from any thread that what comes of the main from now on is another event."""
-        if self.main is not None:
-            self._suspend(self.main)
+            self.cut(stack[-1])
 
     def _under_way(self, stack: list[RunningCallback]) -> CallbackSpan:
         """Return what runs in this thread, which begins now if nothing has come of it so far."""
@@ -337,7 +333,8 @@ class SpanRecorder:
             callback.span = self._open(int(EventKind.RESUME), callback.entity, callback)
         return callback.span
 
-    def _suspend(self, callback: RunningCallback) -> None:
+    def cut(self, callback: RunningCallback) -> None:
+        """Note, from any thread, that what comes of a callback from now on is another event."""
         with self._lock:
             if callback.span is not None:
                 callback.span.flags |= _SUSPENDED

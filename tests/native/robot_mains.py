@@ -136,7 +136,7 @@ def crash_at_end() -> None:
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     node = Crashing(f"crash_{name}")
     out = node.create_publisher(UInt64, "/numbers", DEPTH)
-    node.create_timer(0.001, publish)
+    node.create_timer(0.02, publish)  # it is hardly ever interrupted in the middle of it
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):

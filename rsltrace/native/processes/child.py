@@ -31,6 +31,7 @@ from rsltrace.native.priorities import Priorities
 from rsltrace.native.processes.observers import ProcessObservers, SpanSender
 from rsltrace.native.processes.wire import EntryOrder, Link, LinkError
 from rsltrace.native.running_entry import RunningEntry, destroy
+from rsltrace.native.span_recorder import RunningCallback
 from rsltrace.native.support import Patience
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import search_path
@@ -49,7 +50,7 @@ class RunningMain:
         self,
         entry: JobEntry,
         observers: ProcessObservers,
-        tell_now: Callable[[], object],
+        tell_now: Callable[[RunningCallback | None], object],
         *,
         echo: bool,
     ) -> None:
@@ -147,8 +148,7 @@ class RunningMain:
 
         @wraps(original)
         def end(*words: Any, **more: Any) -> Any:
-            self._observers.recorder.pause()
-            self._tell_now()
+            self._tell_now(self._observers.recorder.current())
             return original(*words, **more)
 
         return end
@@ -306,9 +306,9 @@ class _EntryProcess:
                 self._link.send("stuck")
             os._exit(0)
 
-    def _tell_now(self) -> None:
+    def _tell_now(self, under_way: RunningCallback | None) -> None:
         if self._sender is not None:  # this is no copy
-            self._sender.tell_now()
+            self._sender.tell_now(under_way)
 
     def _forked(self) -> None:
         with suppress(OSError):

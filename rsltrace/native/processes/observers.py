@@ -29,7 +29,7 @@ from rsltrace.native.message_observer import MessageObserver
 from rsltrace.native.node_observer import NodeObserver
 from rsltrace.native.observed_entities import ObservedEntities
 from rsltrace.native.processes.wire import Link, SpanEncoder
-from rsltrace.native.span_recorder import SpanRecorder
+from rsltrace.native.span_recorder import RunningCallback, SpanRecorder
 from rsltrace.native.support import Patience
 from rsltrace.trace.native import CUT_AFTER_NS
 
@@ -200,7 +200,7 @@ class SpanSender(threading.Thread):
         self._is_constructed = is_constructed
         self._has_told = False
         self._over = threading.Event()
-        self._asked: SimpleQueue[threading.Event] = SimpleQueue()
+        self._asked: SimpleQueue[tuple[RunningCallback | None, threading.Event]] = SimpleQueue()
         self._begun_ns = time.process_time_ns()
         self._own_ns = 0
         """Processor time of this thread."""
@@ -209,21 +209,26 @@ class SpanSender(threading.Thread):
     def run(self) -> None:
         with suppress(OSError):  # the run is gone, and so is this process in a moment
             while not self._over.is_set():
-                told = None
+                under_way, told = None, None
                 with suppress(Empty):
-                    told = self._asked.get(timeout=_EVERY_S)
+                    under_way, told = self._asked.get(timeout=_EVERY_S)
+                recorder = self._observers.recorder
+                for callback in (under_way, None if told is None else recorder.main):
+                    if callback is not None:
+                        recorder.cut(callback)
                 self._tell(CUT_AFTER_NS)
                 self._own_ns = time.thread_time_ns()
                 if told is not None:
                     told.set()
 
-    def tell_now(self) -> None:
-        """Tell what was observed so far, and wait for it: not for ever, since a signal handler that
-        ends the program may have interrupted what keeps a lock."""
+    def tell_now(self, under_way: RunningCallback | None = None) -> None:
+        """Tell what was observed so far, also of the main and of a callback ``under_way``, and wait
+        for it: not for ever, and without taking any lock, since a signal handler that ends the
+        program may have interrupted what keeps it."""
         if self._over.is_set() or threading.current_thread() is self:
             return
-        self._observers.recorder.pause_main()
-        self._asked.put(told := threading.Event())
+        told = threading.Event()
+        self._asked.put((under_way, told))
         Patience(_WAITS_S).wait(told.wait, told.is_set)
 
     def tell_at_once(self) -> None:
