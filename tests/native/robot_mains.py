@@ -110,10 +110,14 @@ def crash() -> None:
 
 def crash_at_end() -> None:
     """Publish numbers that begin with an argument, and be killed as it ends: after ``spin``, in
-    ``destroy`` of its node after another number, or in the ``shutdown`` that it calls itself. A
-    file says what it has published."""
+    ``destroy`` of its node after another number, in the ``shutdown`` that it calls itself, or at
+    the ``exit`` of Python. A file says what it has published."""
     name, where = sys.argv[1:]
     numbers, sent = count_from(int(name) * 100_000), []
+
+    class Late:
+        def __del__(self, kill: Any = os.kill, pid: int = os.getpid()) -> None:
+            kill(pid, 11)  # there is no module any more
 
     class Crashing(Node):
         def destroy_node(self) -> None:
@@ -130,7 +134,10 @@ def crash_at_end() -> None:
 
     def end() -> None:
         Path(name).write_text(json.dumps(sent))
-        os.kill(os.getpid(), signal.SIGSEGV)
+        if where == "exit":
+            sys.late = Late()  # type: ignore[attr-defined]
+        else:
+            os.kill(os.getpid(), signal.SIGSEGV)
 
     # rclpy's handlers shut down, and publishing fails from then on.
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)

@@ -363,7 +363,7 @@ def test_a_process_that_fails_is_named_and_the_trace_is_kept(
             assert words in {output.entity for output in outputs if output.kind == 1}
 
 
-@pytest.mark.parametrize("where", ["spin", "destroy", "shutdown"])
+@pytest.mark.parametrize("where", ["spin", "destroy", "shutdown", "exit"])
 def test_all_that_a_main_has_done_that_crashes_at_its_end_is_kept(
     where: str, tmp_path: Path
 ) -> None:
@@ -376,6 +376,7 @@ def test_all_that_a_main_has_done_that_crashes_at_its_end_is_kept(
     assert done.returncode == 0, done.stderr
     assert "was killed by SIGSEGV" in done.stderr
     with Trace.open(tmp_path / "run.mcap") as trace:
+        assert ("missing" in trace.result) == (where != "exit")  # it has told that it has told all
         sent = [trace.decode("/numbers", data).data for _, _, data in trace.messages("/numbers")]  # type: ignore[attr-defined]
     for name in range(1, 5):
         own = [number for number in sent if number // 100_000 == name]

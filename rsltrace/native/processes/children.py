@@ -129,11 +129,14 @@ class ObservedProcess(threading.Thread):
                 self._told(self, ("look",))
                 time.sleep(_LOOK_AT_PROGRAMS_S)
             return status
-        try:
-            return self._process.wait(_REAPED_WITHIN_S)
-        except subprocess.TimeoutExpired:
+
+        def wait(seconds: float) -> None:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(seconds)
+
+        if not Patience(_REAPED_WITHIN_S).wait(wait, lambda: self._process.poll() is not None):
             self.kill()
-            return self._process.wait()
+        return self._process.wait()
 
     def go(self) -> None:
         """Let it begin."""
