@@ -16,7 +16,6 @@ from rsltrace.native.callback_observer import EXECUTORS, CallbackObserver, make_
 from rsltrace.native.message_observer import MessageObserver
 from rsltrace.native.native_run import (
     ENDS_WITHIN_S,
-    LOOK_EVERY_S,
     NativeOptions,
     NativeResult,
     NativeRun,
@@ -28,7 +27,7 @@ from rsltrace.native.priorities import Priorities
 from rsltrace.native.processes.run import MultiProcessRun
 from rsltrace.native.running_entry import RunningEntry, destroy
 from rsltrace.native.span_recorder import SpanRecorder
-from rsltrace.native.support import domain
+from rsltrace.native.support import Patience, domain
 from rsltrace.run.inputs import expand_launch_files
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import RunCallbacks, preserved_process, search_path
@@ -124,10 +123,10 @@ class SingleProcessRun(NativeRun):
             self.look(self.recorder.count, self.recorder.activity_ns)
 
     def _wait_for(self, one: RunningEntry) -> None:
-        deadline = time.monotonic() + _CONSTRUCTED_WITHIN_S
-        while not one.constructed.wait(LOOK_EVERY_S):
-            if self.ending is not None or time.monotonic() > deadline:
-                return
+        constructed = one.constructed
+        Patience(_CONSTRUCTED_WITHIN_S).wait(
+            constructed.wait, lambda: constructed.is_set() or self.ending is not None
+        )
 
     def _make_executor(self) -> Any:
         return make_executor(EXECUTORS[self.options.executor], self.priorities)
@@ -155,11 +154,10 @@ class SingleProcessRun(NativeRun):
         """
         for one in self._running:
             one.stop()
-        deadline = time.monotonic() + ENDS_WITHIN_S
+        patience = Patience(ENDS_WITHIN_S)
         for one in self._running:
-            one.join(max(deadline - time.monotonic(), 0.1))
-            while one.busy and time.monotonic() < deadline:
-                time.sleep(LOOK_EVERY_S)
+            patience.wait_for_end(one)
+            patience.wait(time.sleep, lambda one=one: not one.busy)  # threads of its executor
         stuck = {one.entry.name: place_of(one.busy) for one in self._running if one.busy}
         ended_after = self.recorder.count
         for one in self._running:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import FrameType
 
@@ -167,10 +168,15 @@ class SpanRecorder:
         self.activity_ns = 0
         """When something was last sent, steady."""
         self.until_ns = 0
+        self.main: RunningCallback | None = None
+        """The main of this process."""
+        self.after_each: Callable[[], object] | None = None
+        """Called after what a callback or a thread has sent, logged or made, and after its end."""
 
     def unlock(self) -> None:
         """Go on in a forked process, where no other thread gives the lock back."""
         self._lock = threading.Lock()
+        self.after_each = None
 
     def now_ns(self) -> int:
         """Read the steady clock."""
@@ -190,7 +196,7 @@ class SpanRecorder:
         """Note that a callback begins in this thread; what ran there is suspended."""
         stack = self._stack()
         if stack:
-            self._suspend(stack[-1])
+            self.cut(stack[-1])
         callback = RunningCallback(entity)
         stack.append(callback)
         with self._lock:
@@ -203,7 +209,7 @@ class SpanRecorder:
     def suspend(self) -> None:
         """Note that the callback awaits something, and goes on with ``resume``."""
         callback = self._stack().pop()
-        self._suspend(callback)
+        self.cut(callback)
 
     def resume(self, callback: RunningCallback) -> None:
         """Note that a callback goes on that awaited something.
@@ -212,19 +218,22 @@ class SpanRecorder:
         """
         stack = self._stack()
         if stack:
-            self._suspend(stack[-1])
+            self.cut(stack[-1])
         stack.append(callback)
 
     def end(self, failure: CallbackError | None = None) -> None:
         """Note that the callback that runs in this thread is over."""
         if failure is not None:
             self.add(failure)
-        with self.interrupts, self._lock:
-            callback = self._local.stack.pop()
-            if callback.span is not None:
-                callback.span.flags |= _RAISED if failure is not None else 0
-                self._close(callback.span)
-                callback.span = None
+        with self.interrupts:
+            with self._lock:
+                callback = self._local.stack.pop()
+                if callback.span is not None:
+                    callback.span.flags |= _RAISED if failure is not None else 0
+                    self._close(callback.span)
+                    callback.span = None
+            if self.after_each is not None:
+                self.after_each()
 
     def add(self, output: Output, begun_ns: int = 0) -> tuple[CallbackSpan, int]:
         """Add an output of what runs in this thread; return where it is.
@@ -240,7 +249,10 @@ class SpanRecorder:
             span.outputs.append(output)
             if begun_ns:
                 span.observer_ns += self.now_ns() - begun_ns
-            return span, len(span.outputs) - 1
+            place = len(span.outputs) - 1
+        if self.after_each is not None:
+            self.after_each()
+        return span, place
 
     def sending(self) -> CallbackSpan:
         """Return the event that is about to send something, which has begun then: whoever gets it
@@ -262,6 +274,8 @@ class SpanRecorder:
                     span.observer_ns += self.now_ns() - begun_ns
             if span.owner is None:
                 self._close(span)
+        if self.after_each is not None:
+            self.after_each()
 
     def current(self) -> RunningCallback | None:
         """Return the callback that runs in this thread."""
@@ -305,11 +319,12 @@ class SpanRecorder:
                 self._local.thread = self._threads
         return stack
 
-    def pause(self, entity: ObservedEntity) -> None:
-        """Note that a main waits: what comes of it afterwards is another event."""
+    def pause(self, entity: ObservedEntity | None = None) -> None:
+        """Note that what runs in this thread waits, or only a main: what comes of it afterwards is
+        another event."""
         stack = self._stack()
-        if stack and stack[-1].entity is entity:
-            self._suspend(stack[-1])
+        if stack and entity in (None, stack[-1].entity):
+            self.cut(stack[-1])
 
     def _under_way(self, stack: list[RunningCallback]) -> CallbackSpan:
         """Return what runs in this thread, which begins now if nothing has come of it so far."""
@@ -320,7 +335,8 @@ class SpanRecorder:
             callback.span = self._open(int(EventKind.RESUME), callback.entity, callback)
         return callback.span
 
-    def _suspend(self, callback: RunningCallback) -> None:
+    def cut(self, callback: RunningCallback) -> None:
+        """Note, from any thread, that what comes of a callback from now on is another event."""
         with self._lock:
             if callback.span is not None:
                 callback.span.flags |= _SUSPENDED

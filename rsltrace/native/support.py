@@ -7,6 +7,7 @@ import os
 import random
 import socket
 import struct
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -88,6 +89,33 @@ def _is_quiet(number: int) -> bool:
         except OSError:
             return False
     return True
+
+
+_PART_S = 0.05
+
+
+class Patience:
+    """So many seconds for several waits, but for those in which the whole machine stands still.
+
+    They are counted in short parts: of one that a suspended or stalled machine makes long, whoever
+    is waited for has had nothing either.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._left = round(seconds / _PART_S)
+
+    def wait(self, wait: Callable[[float], object], is_met: Callable[[], bool]) -> bool:
+        """Wait with ``wait(seconds)`` until something is met; return whether it is."""
+        while not is_met():
+            if self._left <= 0:
+                return False
+            self._left -= 1
+            wait(_PART_S)
+        return True
+
+    def wait_for_end(self, thread: threading.Thread) -> bool:
+        """Wait for a thread; return whether it has ended."""
+        return self.wait(thread.join, lambda: not thread.is_alive())
 
 
 # Putting a wrapper around a function for a while.

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from itertools import count as count_from
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ class Counting(Node):
         self.create_subscription(UInt64, "/numbers", self.on_number, DEPTH)
         self.create_subscription(String, "/same", self.on_same, DEPTH)
         self.create_timer(self.declare_parameter("period", 0.01).value, self.on_timer)
+        self.told = self.declare_parameter("told", "").value
 
     def on_timer(self) -> None:
         self.out.publish(UInt64(data=self.next))
@@ -57,9 +59,8 @@ class Counting(Node):
 
     def destroy_node(self) -> None:
         """Write down what it has counted, if it is to be told."""
-        told = self.declare_parameter("told", "").value
-        if told:
-            Path(told).write_text(json.dumps(self.counted()))
+        if self.told:
+            Path(self.told).write_text(json.dumps(self.counted()))
         super().destroy_node()
 
     def counted(self) -> dict[str, Any]:
@@ -76,15 +77,24 @@ def count() -> None:
         pass
     finally:
         Path(sys.argv[1]).write_text(json.dumps(node.counted()))
+        end(node)
+
+
+def end(node: Node) -> None:
+    """End properly: Fast DDS crashes now and then if a program ends while it has nodes."""
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 def talk() -> None:
     """Publish in a loop, without a spin."""
     rclpy.init()
-    publisher = Node("talk").create_publisher(UInt64, "/numbers", 100)
+    node = Node("talk")
+    publisher = node.create_publisher(UInt64, "/numbers", 100)
     for number in range(int(sys.argv[1])):
         publisher.publish(UInt64(data=number))
         time.sleep(0.05)
+    end(node)
 
 
 def crash() -> None:
@@ -98,15 +108,63 @@ def crash() -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
+def crash_at_end() -> None:
+    """Publish numbers that begin with an argument, and be killed as it ends: after ``spin``, in
+    ``destroy`` of its node after another number, in the ``shutdown`` that it calls itself, or at
+    the ``exit`` of Python. A file says what it has published."""
+    name, where = sys.argv[1:]
+    numbers, sent = count_from(int(name) * 100_000), []
+
+    class Late:
+        def __del__(self, kill: Any = os.kill, pid: int = os.getpid()) -> None:
+            kill(pid, 11)  # there is no module any more
+
+    class Crashing(Node):
+        def destroy_node(self) -> None:
+            end()
+
+    def publish() -> None:
+        out.publish(UInt64(data=(number := next(numbers))))
+        sent.append(number)
+        if len(sent) == ENOUGH:
+            Path(f"{name}.heard").touch()
+            if where == "shutdown":
+                rclpy.get_default_context().on_shutdown(end)
+                rclpy.shutdown()
+
+    def end() -> None:
+        Path(name).write_text(json.dumps(sent))
+        if where == "exit":
+            sys.late = Late()  # type: ignore[attr-defined]
+        else:
+            os.kill(os.getpid(), signal.SIGSEGV)
+
+    # rclpy's handlers shut down, and publishing fails from then on.
+    rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    node = Crashing(f"crash_{name}")
+    out = node.create_publisher(UInt64, "/numbers", DEPTH)
+    node.create_timer(0.02, publish)  # it is hardly ever interrupted in the middle of it
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    if where == "destroy":
+        publish()
+        node.destroy_node()
+    end()
+
+
 def fork() -> None:
     """Fork, and be a node in both processes."""
     copy = os.fork()
     rclpy.init()
-    publisher = Node("fork").create_publisher(UInt64, "/numbers", 10)
+    node = Node("fork")
+    publisher = node.create_publisher(UInt64, "/numbers", 10)
     publisher.publish(UInt64(data=copy == 0))
     time.sleep(0.1)
     if copy:
         os.waitpid(copy, 0)
+    end(node)
 
 
 def become() -> None:

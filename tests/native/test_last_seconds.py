@@ -355,7 +355,7 @@ nodes:
     on_exception: log
     start_after: {{started: robot:Talker, delay: 1s}}  # there is a file soon after its end
   - {{program: {compiled("../native/counting.c")}, arguments: [b, "200000", "10"], name: b}}
-record: {{last: 8s}}
+record: {{last: 25s}}
 """
     process = subprocess.Popen(
         [*COMMAND, "record", "--native", str(job(tmp_path, text)), "-o", "run.mcap"],
@@ -367,7 +367,7 @@ record: {{last: 8s}}
     )
     try:
         wait_until((tmp_path / "run-1.mcap").exists, process)
-        time.sleep(8.5)  # more than what is kept
+        time.sleep(25.5)  # more than what is kept, and a machine may stand still
         process.send_signal(signal.SIGUSR1)
         wait_until((tmp_path / "run-2.mcap").exists, process)
         process.send_signal(signal.SIGINT)

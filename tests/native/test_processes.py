@@ -11,11 +11,13 @@ import subprocess
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rsltrace.errors import RsltraceError
 from rsltrace.trace.contents import check_contents
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
@@ -290,7 +292,8 @@ def test_other_programs_of_a_launch_file_run_and_what_they_start_is_observed(
     tmp_path: Path, command: Any
 ) -> None:
     """The shell starts Python: the first of it is a node, the others are told to end by the end."""
-    node = f"{sys.executable} -c 'import robot_mains; robot_mains.talk()' 5"
+    others = "until test -s said && test -e trapped; do sleep 0.1; done"  # they have come so far
+    node = f"{others}; {sys.executable} -c 'import robot_mains; robot_mains.talk()' 5"
     (tmp_path / "a.launch.py").write_text(f"""
 from launch import LaunchDescription
 from launch.actions import ExecuteProcess, Shutdown
@@ -300,7 +303,7 @@ def generate_launch_description():
         ExecuteProcess(cmd=[{node!r}], shell=True, on_exit=Shutdown(),
                        additional_env={{"PYTHONPATH": {str(ROBOT)!r}}}),
         ExecuteProcess(cmd=["sh", "-c", 'echo "$1" > said; sleep 1000', "sh", "a  b"]),
-        ExecuteProcess(cmd=["sh", "-c", "trap '' INT; while true; do sleep 0.1; done"]),
+        ExecuteProcess(cmd=["sh", "-c", "trap '' INT; touch trapped; while :; do sleep 1; done"]),
     ])
 """)
     done = command("record", "--native", "--launch", "a.launch.py", "-o", "run.mcap")
@@ -358,6 +361,28 @@ def test_a_process_that_fails_is_named_and_the_trace_is_kept(
             (words,) = [e.id for e in trace.entities.values() if e.name == "/last_words"]
             outputs = [o for e in events_of(trace) for o in trace.outputs_of(e.index)]
             assert words in {output.entity for output in outputs if output.kind == 1}
+
+
+@pytest.mark.parametrize("where", ["spin", "destroy", "shutdown", "exit"])
+def test_all_that_a_main_has_done_that_crashes_at_its_end_is_kept(
+    where: str, tmp_path: Path
+) -> None:
+    nodes = [
+        f"  - {{main: robot_mains:crash_at_end, arguments: [{n}, {where}], on_exception: log}}\n"
+        for n in range(1, 5)
+    ]
+    stop = "stop: {function: robot_mains:all_heard, timeout: 300s}\n"
+    done = record(tmp_path, f"nodes:\n{''.join(nodes)}{stop}")
+    assert done.returncode == 0, done.stderr
+    assert "was killed by SIGSEGV" in done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert ("missing" in trace.result) == (where != "exit")  # it has told that it has told all
+        sent = [trace.decode("/numbers", data).data for _, _, data in trace.messages("/numbers")]  # type: ignore[attr-defined]
+    for name in range(1, 5):
+        own = [number for number in sent if number // 100_000 == name]
+        counted = json.loads((tmp_path / str(name)).read_text())
+        assert [number for number in own if number in counted] == counted
+        assert len(own) - len(counted) in (0, 1)  # it may be interrupted before it has counted one
 
 
 def test_all_that_a_killed_program_has_done_is_kept(
@@ -457,8 +482,9 @@ def test_no_process_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
 
 
 def has_messages(path: Path, topic: str) -> bool:
-    with Trace.open(path) as trace:
+    with suppress(RsltraceError), Trace.open(path) as trace:  # it is being written
         return any(trace.messages(topic))
+    return False
 
 
 def test_the_job_is_judged_before_anything_begins(tmp_path: Path) -> None:

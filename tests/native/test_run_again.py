@@ -114,9 +114,11 @@ def serve():
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    # Its threads end before the node does: it may crash otherwise, and with it goes what it traced.
-    # rclpy's own shutdown does not wait for them.
+    # Its threads end before the node does, which may crash otherwise: rclpy's own shutdown does not
+    # wait for them. And the node ends before the program.
     executor._executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
 """
 JOB = """\
 nodes:
@@ -319,7 +321,9 @@ def test_other_orders_from_a_time_on(tmp_path: Path, command: Any) -> None:
 def test_a_run_without_callbacks_is_run_again(tmp_path: Path, command: Any) -> None:
     (tmp_path / "talking.py").write_text(
         "import rclpy\nfrom std_msgs.msg import String\n\ndef main():\n    rclpy.init()\n"
-        "    rclpy.create_node('a').create_publisher(String, '/t', 1).publish(String())\n"
+        "    node = rclpy.create_node('a')\n"
+        "    node.create_publisher(String, '/t', 1).publish(String())\n"
+        "    node.destroy_node()\n    rclpy.shutdown()\n"
     )
     (tmp_path / "job.yaml").write_text("nodes: [{main: 'talking:main'}]\n")
     assert command("record", "--native", "job.yaml", "-o", "native.mcap").returncode == 0

@@ -14,10 +14,16 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.job import Job
 from rsltrace.job.parts.record import LastSpec
+from rsltrace.native import support
 from rsltrace.native.last_seconds import LastSeconds
 from rsltrace.native.native_run import NativeOptions, NativeRun
+from rsltrace.native.observed_entities import ObservedEntities
+from rsltrace.native.processes import observers
+from rsltrace.native.processes.observers import SpanSender
+from rsltrace.native.span_recorder import SpanRecorder, TaskCreation
 from rsltrace.run.process import RunCallbacks
 from rsltrace.simulation.loop.stop import Stop
+from rsltrace.trace.model.event import EventKind
 
 LINES = 60
 """More than are run before the middle of each of them was reached."""
@@ -73,3 +79,30 @@ def test_a_signal_may_come_while_another_one_has_a_file_written() -> None:
         last.trigger("SIGUSR1", at_once=True)
 
     assert ends_if_interrupted(handler, handler)
+
+
+def test_a_program_may_shut_down_in_a_signal_handler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was observed is told then, by a thread that waits for the lock of whom it interrupts."""
+    monkeypatch.setattr(observers, "_WAITS_S", 0.002)
+    monkeypatch.setattr(support, "_PART_S", 0.002)
+    frames: list[tuple[Any, ...]] = []
+    link = SimpleNamespace(send=lambda *frame: frames.append(frame))
+    recorder = SpanRecorder()
+    process = SimpleNamespace(
+        recorder=recorder,
+        entities=ObservedEntities(recorder.add),
+        message_observer=SimpleNamespace(unreadable=0),
+    )
+    sender = SpanSender(link, process, lambda: True)  # type: ignore[arg-type]
+    sender.start()
+
+    def main() -> None:
+        recorder.begin(int(EventKind.TIMER), None)
+        recorder.add(TaskCreation())
+        recorder.end()
+
+    assert ends_if_interrupted(main, lambda: sender.tell_now(recorder.current()))
+    sender.finish()
+    sender.join()
+    spans = [span for what, *values in frames if what == "spans" for span in values[-1]]
+    assert sum(len(span[-1]) for span in spans) == LINES  # one task of each call of main

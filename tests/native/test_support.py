@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.job import Job, load_job
-from rsltrace.native.support import ignored
+from rsltrace.native.support import Patience, ignored
 
 FOLLOWED = {
     *("nodes", "bags", "launch", "ros_arguments", "search_path", "stop"),
@@ -25,6 +25,14 @@ def test_every_key_of_a_job_is_followed_refused_or_named_as_without_effect() -> 
     named = ignored(job.with_values(**{**given, "nodes": ()}))
     keys = {name for name in everything if name.removesuffix("_ns") in named}
     assert everything - keys == FOLLOWED | REFUSED
+
+
+def test_a_machine_that_stands_still_takes_no_time_from_those_who_are_waited_for() -> None:
+    waits: list[float] = []  # each of which may have lasted for minutes
+    patience = Patience(1.0)
+    assert patience.wait(waits.append, lambda: len(waits) == 15)
+    assert not patience.wait(waits.append, lambda: False)
+    assert sum(waits) == pytest.approx(1.0)
 
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -23,9 +23,11 @@ from rsltrace.run.plans.bags import (
     with_progress,
 )
 
-_SETTLED_S = 0.5
-_SETTLED_WITHIN_S = 30.0
-"""How long the player waits for anybody to listen: constructors load models, machines are busy."""
+_LOOK_S = 0.02
+_SETTLED_LOOKS = 25
+_LOOKS_MAX = 1500
+"""How long the player waits for anybody to listen: constructors load models, machines are busy, and
+one that stands still takes no time from them."""
 
 _Played = Iterator[tuple[int, Any, bytes]]
 
@@ -74,15 +76,14 @@ def _publish(messages: _Played, start_ns: int) -> None:
 
 def _wait_for_listeners(publishers: list[Any]) -> None:
     """Wait until as many subscriptions have been found as there are, as far as anybody can tell."""
-    since = begun = time.monotonic()
-    before: list[int] = []
-    while time.monotonic() - begun < _SETTLED_WITHIN_S:
+    same, before = 0, list[int]()
+    for _ in range(_LOOKS_MAX):
         found = [publisher.get_subscription_count() for publisher in publishers]
-        if found != before:
-            since, before = time.monotonic(), found
-        elif any(found) and time.monotonic() - since > _SETTLED_S:
+        same = same + 1 if found == before else 0
+        if any(found) and same > _SETTLED_LOOKS:
             return
-        time.sleep(0.02)
+        before = found
+        time.sleep(_LOOK_S)
 
 
 def _profile(values: dict[str, Any]) -> Any:

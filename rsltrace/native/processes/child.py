@@ -32,6 +32,7 @@ from rsltrace.native.processes.observers import ProcessObservers, SpanSender
 from rsltrace.native.processes.wire import EntryOrder, Link, LinkError
 from rsltrace.native.running_entry import RunningEntry, destroy
 from rsltrace.native.span_recorder import RunningCallback
+from rsltrace.native.support import Patience
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import search_path
 from rsltrace.run.provenance import source_files
@@ -45,28 +46,37 @@ from rsltrace.trace.model.event import EventKind
 class RunningMain:
     """Runs the main of an entry. What it does between its callbacks is its own events."""
 
-    def __init__(self, entry: JobEntry, observers: ProcessObservers, *, echo: bool) -> None:
+    def __init__(
+        self,
+        entry: JobEntry,
+        observers: ProcessObservers,
+        tell_now: Callable[[RunningCallback | None], object],
+        *,
+        echo: bool,
+    ) -> None:
+        """``tell_now`` tells the run what was observed: its end may be a crash."""
         self._entry = entry
+        self._tell_now = tell_now
         self._observers = observers
         self._words = [word for part in entry.arguments[:1] for word in part.arguments]
         if not echo:
             self._words += ["--ros-args", "--disable-stdout-logs"]
-        self._callback: RunningCallback | None = None
         self._is_over = False
 
     def is_constructed(self) -> bool:
         """Return whether it has waited or spun for the first time, or has ended."""
-        callback = self._callback
+        callback = self._observers.recorder.main
         return self._is_over or (callback is not None and callback.span is None)
 
     def run(self) -> None:
         """Run it to its end; what it raises comes out. SIGINT interrupts it from now on."""
         recorder, entities, entry = self._observers.recorder, self._observers.entities, self._entry
-        self._callback = callback = recorder.begin(int(EventKind.CONSTRUCT), None)
+        callback = recorder.begin(int(EventKind.CONSTRUCT), None)
         entity = entities.add((), None, EntityKind.MAIN, entry.name, runs=entry.make)
         callback.entity = entity
         if callback.span is not None:
             callback.span.entity = entity
+        recorder.main = callback
         self._become_main(entity)
         failure = None
         try:
@@ -90,6 +100,7 @@ class RunningMain:
         """Have this process be what ``ros2 run`` would have started."""
         import rclpy.clock
         import rclpy.context
+        import rclpy.node
         import rclpy.timer
 
         main = ModuleType("__main__")
@@ -105,6 +116,12 @@ class RunningMain:
             (rclpy.clock.Clock, "sleep_until"),
         ):
             setattr(owner, name, self._pausing(getattr(owner, name), entity))
+        for owner, name in (
+            (context, "shutdown"),
+            (context, "try_shutdown"),
+            (rclpy.node.Node, "destroy_node"),
+        ):
+            setattr(owner, name, self._ending(getattr(owner, name)))
 
     def _with_words(self, original: Callable[..., None]) -> Callable[..., None]:
         """Add the ROS arguments of the entry to those of ``rclpy.init``."""
@@ -125,6 +142,16 @@ class RunningMain:
             return original(*words, **more)
 
         return sleep
+
+    def _ending(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Have all told before what may crash."""
+
+        @wraps(original)
+        def end(*words: Any, **more: Any) -> Any:
+            self._tell_now(self._observers.recorder.current())
+            return original(*words, **more)
+
+        return end
 
 
 def main(number: int) -> None:
@@ -245,7 +272,7 @@ class _EntryProcess:
         self._link.send("raised", what, node, kind, exception_text(error), user_traceback(error))
 
     def _run_main(self, entry: JobEntry) -> int:
-        running = RunningMain(entry, self._observers, echo=self._order.echo)
+        running = RunningMain(entry, self._observers, self._tell_now, echo=self._order.echo)
         self._begin(running.is_constructed)
         try:
             running.run()
@@ -267,9 +294,13 @@ class _EntryProcess:
         with suppress(OSError):
             if self._link.receive() is None:
                 os._exit(1)
+        if self._sender is not None:
+            self._sender.tell_at_once()
+        with suppress(OSError):
+            self._link.send("stopping")
         if self._entry is not None:
             self._entry.stop()
-        if not self._is_over.wait(ENDS_WITHIN_S):
+        if not Patience(ENDS_WITHIN_S).wait(self._is_over.wait, self._is_over.is_set):
             from rsltrace.run.watchdog import place_of
 
             place = place_of(threading.main_thread().ident)
@@ -277,6 +308,10 @@ class _EntryProcess:
             with suppress(OSError):
                 self._link.send("stuck", place)
             os._exit(0)
+
+    def _tell_now(self, under_way: RunningCallback | None) -> None:
+        if self._sender is not None:  # this is no copy
+            self._sender.tell_now(under_way)
 
     def _forked(self) -> None:
         with suppress(OSError):

@@ -15,10 +15,13 @@ from pathlib import Path
 from rsltrace.child_processes import kill_group, start_connected
 from rsltrace.errors import JobError
 from rsltrace.native.processes.wire import EntryOrder, Frame, Link
+from rsltrace.native.support import Patience
 
 _MAIN = "rsltrace.native.processes.child"
 _LOOK_S = 0.2
 _LOOK_AT_PROGRAMS_S = 0.05
+_HEARS_WITHIN_S = 1.0
+"""One that is another program by now, or keeps the interpreter, does not."""
 _REAPED_WITHIN_S = 10.0
 """A process that was killed, or has closed its socket, is gone after a moment."""
 
@@ -67,6 +70,8 @@ class ObservedProcess(threading.Thread):
         self.has_told_all = False
         self.forks = 0
         self.is_stopping = False
+        self.has_heard = threading.Event()
+        """It tells all at once, as it is about to end, or has ended."""
         self.is_stuck, self.stuck_at = False, ""
         self.exit_text = ""
         self._told = told
@@ -113,6 +118,7 @@ class ObservedProcess(threading.Thread):
         self.kill()  # what it has left behind
         self.is_over = True
         self._ended(self, status)
+        self.has_heard.set()
         self.is_ready.set()
         self._link.close()
 
@@ -123,11 +129,14 @@ class ObservedProcess(threading.Thread):
                 self._told(self, ("look",))
                 time.sleep(_LOOK_AT_PROGRAMS_S)
             return status
-        try:
-            return self._process.wait(_REAPED_WITHIN_S)
-        except subprocess.TimeoutExpired:
+
+        def wait(seconds: float) -> None:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(seconds)
+
+        if not Patience(_REAPED_WITHIN_S).wait(wait, lambda: self._process.poll() is not None):
             self.kill()
-            return self._process.wait()
+        return self._process.wait()
 
     def go(self) -> None:
         """Let it begin."""
@@ -136,7 +145,7 @@ class ObservedProcess(threading.Thread):
             self._link.send("go")
 
     def stop(self) -> None:
-        """Tell it to end: as ``ros2 launch`` does, if it is a main."""
+        """Tell it to end. ``interrupt`` has to follow."""
         self.is_stopping = True
         if not self.is_ready.is_set():  # it is being started again
             self.has_begun = False
@@ -144,11 +153,15 @@ class ObservedProcess(threading.Thread):
             return
         with suppress(OSError):
             self._link.send("stop")
+
+    def interrupt(self) -> None:
+        """Tell it to end as ``ros2 launch`` does, if it is a main: once it tells all at once."""
         if not (self.what.is_main and self.has_begun):
             return
         if self.what.order.command:
             self._signal_all(signal.SIGINT)
         else:
+            Patience(_HEARS_WITHIN_S).wait(self.has_heard.wait, self.has_heard.is_set)
             self._process.send_signal(signal.SIGINT)
 
     def terminate(self) -> None:

@@ -21,6 +21,7 @@ from ctypes import (
     string_at,
 )
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from rsltrace.native.callback_observer import CallbackObserver
@@ -28,7 +29,8 @@ from rsltrace.native.message_observer import MessageObserver
 from rsltrace.native.node_observer import NodeObserver
 from rsltrace.native.observed_entities import ObservedEntities
 from rsltrace.native.processes.wire import Link, SpanEncoder
-from rsltrace.native.span_recorder import SpanRecorder
+from rsltrace.native.span_recorder import RunningCallback, SpanRecorder
+from rsltrace.native.support import Patience
 from rsltrace.trace.native import CUT_AFTER_NS
 
 # Which publisher a message is from: what rcl knows and rclpy does not tell.
@@ -143,6 +145,7 @@ def gids(extension: Any) -> PublisherGids | None:
 
 
 _EVERY_S = 0.05
+_WAITS_S = 1.0
 _AT_ONCE = 500
 """Spans in one frame, at most."""
 
@@ -180,7 +183,12 @@ class ProcessObservers:
 
 
 class SpanSender(threading.Thread):
-    """Tells the run what was observed, again and again, until ``finish``."""
+    """Tells the run what was observed, again and again, until ``finish``.
+
+    A program may crash as it ends (executors with threads, nodes that are not destroyed): what it
+    does then is told at once. Rejected: sending from the thread that did it, where an exception of
+    a signal handler could leave half a frame.
+    """
 
     def __init__(
         self, link: Link, observers: ProcessObservers, is_constructed: Callable[[], bool]
@@ -192,6 +200,7 @@ class SpanSender(threading.Thread):
         self._is_constructed = is_constructed
         self._has_told = False
         self._over = threading.Event()
+        self._asked: SimpleQueue[tuple[RunningCallback | None, threading.Event]] = SimpleQueue()
         self._begun_ns = time.process_time_ns()
         self._own_ns = 0
         """Processor time of this thread."""
@@ -199,9 +208,33 @@ class SpanSender(threading.Thread):
 
     def run(self) -> None:
         with suppress(OSError):  # the run is gone, and so is this process in a moment
-            while not self._over.wait(_EVERY_S):
+            while not self._over.is_set():
+                under_way, told = None, None
+                with suppress(Empty):
+                    under_way, told = self._asked.get(timeout=_EVERY_S)
+                recorder = self._observers.recorder
+                for callback in (under_way, None if told is None else recorder.main):
+                    if callback is not None:
+                        recorder.cut(callback)
                 self._tell(CUT_AFTER_NS)
                 self._own_ns = time.thread_time_ns()
+                if told is not None:
+                    told.set()
+
+    def tell_now(self, under_way: RunningCallback | None = None) -> None:
+        """Tell what was observed so far, also of the main and of a callback ``under_way``, and wait
+        for it: not for ever, and without taking any lock, since a signal handler that ends the
+        program may have interrupted what keeps it."""
+        if self._over.is_set() or threading.current_thread() is self:
+            return
+        told = threading.Event()
+        self._asked.put((under_way, told))
+        Patience(_WAITS_S).wait(told.wait, told.is_set)
+
+    def tell_at_once(self) -> None:
+        """Tell all from now on when it is there."""
+        self._observers.recorder.after_each = self.tell_now
+        self.tell_now()
 
     def finish(self) -> None:
         """Tell all that is left; of callbacks that still run, as far as they have come."""

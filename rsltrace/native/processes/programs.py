@@ -175,8 +175,7 @@ class ProgramSpans:
             self._ended(thread, record, *fields.unpack(_POINTER))
         elif record.kind == RecordKind.WAIT:
             self._close(thread)
-            if (running := self.recorder.current()) is not None and running.entity is not None:
-                self.recorder.pause(running.entity)
+            self.recorder.pause()
         elif record.kind == RecordKind.SENDING:
             self._sending(thread, record)
         elif record.kind == RecordKind.SENT:
@@ -349,8 +348,7 @@ class ProgramSpans:
         self._missing()
         for thread in self._threads.values():
             self.recorder.enter(thread.local)
-            if (running := self.recorder.current()) is not None and running.entity is not None:
-                self.recorder.pause(running.entity)
+            self.recorder.pause()
 
     def _missing(self) -> None:
         """End everything: nobody knows what has come in between."""

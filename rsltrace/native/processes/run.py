@@ -29,7 +29,7 @@ from rsltrace.native.processes.plans import start_rules, starts_of
 from rsltrace.native.processes.programs import ObservedProgram, variables_of
 from rsltrace.native.processes.wire import EntryOrder, Frame, SpanDecoder
 from rsltrace.native.span_recorder import CallbackSpan, SentMessage, now_ns
-from rsltrace.native.support import check_loopback, domain
+from rsltrace.native.support import Patience, check_loopback, domain
 from rsltrace.run.plans.entries import missed_starts
 from rsltrace.run.stop_rules import has_stop
 from rsltrace.simulation.loop.stop import Stop
@@ -328,6 +328,8 @@ class MultiProcessRun(NativeRun):
             child.exit_text = values[0]
         elif what == "levels":
             self.levels.update(values[0])
+        elif what == "stopping":
+            child.has_heard.set()
         elif what == "stuck":
             child.is_stuck, child.stuck_at = True, str(values[0])
         else:
@@ -449,8 +451,9 @@ class MultiProcessRun(NativeRun):
                 f"of {name}, all after it used os._exit, became another program or closed "
                 "rsltrace's file descriptor"
             )
-        if child.has_begun and status < 0 and status != -signal.SIGINT:
-            lost = "the last 50 ms" if program is None else "what each thread was just doing"
+        if child.has_begun and status < 0 and not (status == -signal.SIGINT or child.has_told_all):
+            is_late = program is None and not child.has_heard.is_set()
+            lost = "the last 50 ms" if is_late else "what each thread was just doing"
             self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {lost}")
 
     def _without_file(self, child: ObservedProcess, program: ObservedProgram) -> Iterator[str]:
@@ -549,18 +552,18 @@ class MultiProcessRun(NativeRun):
         :raises OutputError: if the trace cannot be written.
         """
         ended_after = sum(one[0] for one in self._counts.values())
+        going = [child for child in self.children if not child.is_over]
+        for child in going:
+            child.stop()
+        for child in going:
+            child.interrupt()
+        patience = Patience(ENDS_WITHIN_S)
         for child in self.children:
-            if not child.is_over:
-                child.stop()
-        deadline = time.monotonic() + ENDS_WITHIN_S
-        for child in self.children:
-            child.join(max(deadline - time.monotonic(), 0.1))
-            if child.is_alive():
+            if not patience.wait_for_end(child):
                 child.terminate()
-        deadline = time.monotonic() + _KILLED_WITHIN_S
+        patience = Patience(_KILLED_WITHIN_S)
         for child in self.children:
-            child.join(max(deadline - time.monotonic(), 0.1))
-            if child.is_alive():
+            if not patience.wait_for_end(child):
                 child.is_stuck = True
                 child.kill()
                 child.join()
