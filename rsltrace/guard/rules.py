@@ -313,8 +313,8 @@ def sql_call(statement: str) -> tuple[str, Rule] | None:
     match = _SQL.search(statement)
     if match is None:
         return None
-    draws = match.group().lower().startswith("random")
-    return f"SQLite: {match.group()}", _SQL_RANDOM if draws else _SQL_CLOCK
+    call = match.group() + ")" * match.group().endswith("(")
+    return f"SQLite: {call}", _SQL_RANDOM if call.lower().startswith("random") else _SQL_CLOCK
 
 
 def _is_none(node: ast.expr) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -361,3 +363,50 @@ def test_what_the_c_library_answers_is_a_possible_cause(
     found = diff_files("a.mcap", "b.mcap")
     assert "; possible cause: the result of C library: getenv() at tuned.py:2" in found.sentence
     assert found.divergences[0].root_sentence.endswith("getenv() at tuned.py:2 is not recorded")
+
+
+_DATABASE = "import sqlite3\n"
+_READ = "sqlite3.connect(%s).execute('select v from w').fetchone()[0]"
+
+
+def _write_database(path: Path, value: int) -> None:
+    path.unlink(missing_ok=True)
+    with closing(sqlite3.connect(path)) as made, made:
+        made.execute("create table w (v)")
+        made.execute("insert into w values (?)", (value,))
+
+
+@pytest.mark.parametrize("name", ["'w.db'", "'file:w.db?mode=ro', uri=True"])
+def test_a_database_is_a_file_that_was_read(
+    tmp_path: Path, command: Callable[..., Any], name: str
+) -> None:
+    (tmp_path / "tuned.py").write_text(_DATABASE + _TUNED.replace("BIAS", _READ % name))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for trace, value in (("a", 1), ("b", 2)):
+        _write_database(tmp_path / "w.db", value)
+        assert command("record", "job.yaml", "-o", f"{trace}.mcap").returncode == 0
+    found = diff_files("a.mcap", "b.mcap")
+    assert "; likely cause: /tuned read w.db" in found.sentence, found.sentence
+
+
+def test_a_database_in_use_is_not_read(tmp_path: Path, command: Callable[..., Any]) -> None:
+    """To open and close the file would drop the locks of the node's other connection."""
+    twice = "one, two = [sqlite3.connect('w.db').execute(sql) for sql in (INSERT, 'select 1')]\n"
+    insert = f"{_DATABASE}INSERT = 'insert into w values (2)'\n"
+    (tmp_path / "tuned.py").write_text(insert + twice + _TUNED.replace("BIAS", "1"))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 100ms}\n")
+    _write_database(tmp_path / "w.db", 1)
+    assert command("record", "job.yaml", "-o", "a.mcap").returncode == 0
+    with Trace.open("a.mcap") as trace:
+        values = [f.value for found in trace.answers.values() for f in found if "w.db" in f.call]
+    assert [value.partition(", ")[0] for value in values] == ["8192 bytes", "in use"]
+
+
+def test_what_sqlite_draws_is_a_possible_cause(tmp_path: Path, command: Callable[..., Any]) -> None:
+    drawn = "sqlite3.connect(':memory:').execute('select random()').fetchone()[0]"
+    (tmp_path / "tuned.py").write_text(_DATABASE + _TUNED.replace("BIAS", drawn))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for name in ("a", "b"):
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    sentence = diff_files("a.mcap", "b.mcap").sentence
+    assert "; possible cause: the result of SQLite: random() at tuned.py:" in sentence, sentence

@@ -27,7 +27,8 @@ from rsltrace.trace.model.texts import contrasting_texts, printable, shortened
 CALLS_MAX = 20
 EARLIER_MAX = 3
 _CALL_MAX = 60
-_OF_C = "C library: "
+_UNSEEN = ("C library: ", "SQLite: ", "open('/dev/urandom')", "open('/dev/random')")
+"""What calls begin with whose answers no finding holds."""
 _ANSWERED = (NondeterminismSource.SOCKET, NondeterminismSource.PROCESS)
 # Patterns, compiled at their first use: few traces have such calls.
 _FOLDER = r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)"
@@ -76,13 +77,13 @@ def call_differences(
 
 
 def unrecorded_answer(run: ComparedTrace, view: EventSummary) -> UnrecordedAnswer | None:
-    """Return the last unrecorded answer of a socket, a program or the C library: in an event, else
-    the last one before it in its node; None if there was none."""
+    """Return the last unrecorded answer of a socket or program, else of the C library, SQLite or a
+    device: in an event, else the last one before it in its node; None if there was none."""
     found = [f for f in (*_before(run, view), *_inside(run, view)) if f.mode is GuardMode.WARN]
     one = next((f for f in reversed(found) if f.source in _ANSWERED), None)
     if one is None:
-        of_c = next((f for f in reversed(found) if f.call.startswith(_OF_C)), None)
-        return UnrecordedAnswer(printable(of_c.call), of_c.place, "") if of_c else None
+        one = next((f for f in reversed(found) if f.call.startswith(_UNSEEN)), None)
+        return UnrecordedAnswer(printable(one.call), one.place, "") if one else None
     call = one.call.removesuffix("()") + (f"({one.value})" if one.call.endswith("()") else "")
     place = one.place
     return UnrecordedAnswer(shortened(printable(call), _CALL_MAX), place, one.source.value)
