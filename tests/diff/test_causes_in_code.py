@@ -410,3 +410,26 @@ def test_what_sqlite_draws_is_a_possible_cause(tmp_path: Path, command: Callable
         assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
     sentence = diff_files("a.mcap", "b.mcap").sentence
     assert "; possible cause: the result of SQLite: random() at tuned.py:" in sentence, sentence
+
+
+_GOALS = """
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from test_msgs.action import Fibonacci
+class Boss(Node):
+    def __init__(self):
+        super().__init__("boss")
+        self.client = ActionClient(self, Fibonacci, "plan")
+        self.create_timer(0.1, lambda: self.client.send_goal_async(Fibonacci.Goal(order=3)))
+"""
+
+
+def test_the_seed_is_the_cause_of_another_goal_id(
+    tmp_path: Path, command: Callable[..., Any]
+) -> None:
+    """rclpy draws it, in no code of the user."""
+    (tmp_path / "boss.py").write_text(_GOALS)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: boss:Boss}]\nstop: {duration: 100ms}\n")
+    for seed in (1, 2):
+        assert command("record", "job.yaml", "--seed", seed, "-o", f"{seed}.mcap").returncode == 0
+    assert cause("1.mcap", "2.mcap") == ["seed"]
