@@ -87,9 +87,11 @@ def likely_cause(
         return found
     if (properties := changed_properties(judgement, runs)) is not None:
         return properties
-    if not judgement.is_unexplained:
-        return None
-    return _unguarded_call(run, view, relevance.permissions) or unrecorded_answer(run, view)
+    if judgement.is_unexplained:
+        return _unguarded_call(run, view, relevance.permissions) or unrecorded_answer(run, view)
+    if {setting.name for setting in judgement.settings} == {"hash_seed"}:  # what depends on it?
+        return _unguarded_call(run, view, relevance.permissions)
+    return None
 
 
 def suppressed_exception(

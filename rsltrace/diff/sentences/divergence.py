@@ -457,7 +457,8 @@ def cause_of(of: Judgement) -> str:
         how = f" (to record it, set guard: {{{source}: record}} in the job)" if source else ""
         text = f"{text}; {sentence(of.likely)} is not recorded{how}"
     elif isinstance(of.likely, UnguardedCall):
-        more = f" and {of.likely.more} more calls" if of.likely.more else ""
+        count = of.likely.more
+        more = f" and {count} more call{'s' if count > 1 else ''}" if count else ""
         permission = f", which {of.likely.permission} lets differ"
         text = f"{text}; a possible cause is {sentence(of.likely)}{more}{permission}"
     elif isinstance(of.likely, ErrorInTransition):
