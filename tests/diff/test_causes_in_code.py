@@ -367,6 +367,7 @@ def test_what_the_c_library_answers_is_a_possible_cause(
 
 
 _DATABASE = "import sqlite3\n"
+_FORKED = "os.fork() or os._exit(0)"
 _READ = "sqlite3.connect(%s).execute('select v from w').fetchone()[0]"
 
 
@@ -401,6 +402,35 @@ def test_a_database_in_use_is_not_read(tmp_path: Path, command: Callable[..., An
     with Trace.open("a.mcap") as trace:
         values = [f.value for found in trace.answers.values() for f in found if "w.db" in f.call]
     assert [value.partition(", ")[0] for value in values] == ["8192 bytes", "in use"]
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (
+            "signal.setitimer(signal.ITIMER_REAL, 0)",
+            "signal.setitimer() at tuned.py:11, which comes",
+        ),
+        (_FORKED, "os.fork() at tuned.py:11, which is not recorded"),
+    ],
+    ids=["timer", "fork"],
+)
+def test_what_happens_in_real_time_is_a_possible_cause(
+    tmp_path: Path,
+    command: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+    call: str,
+    told: str,
+) -> None:
+    node = "import os, signal\n" + _TUNED.replace("BIAS", f"FAULT + 0 * len([{call}])")
+    (tmp_path / "tuned.py").write_text(node)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 100ms}\n")
+    for name in ("a", "b"):
+        monkeypatch.setattr("builtins.FAULT", "ab".index(name), raising=False)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    found = diff_files("a.mcap", "b.mcap")
+    assert f"; possible cause: the result of {told}" in found.sentence, found.sentence
+    assert "{process: record}" not in found.divergences[0].root_sentence
 
 
 def test_what_sqlite_draws_is_a_possible_cause(tmp_path: Path, command: Callable[..., Any]) -> None:

@@ -29,6 +29,8 @@ EARLIER_MAX = 3
 _CALL_MAX = 60
 _UNSEEN = ("C library: ", "SQLite: ", "open('/dev/urandom')", "open('/dev/random')")
 """What calls begin with whose answers no finding holds."""
+_ENVIRONMENT, _THREAD = NondeterminismSource.ENVIRONMENT, NondeterminismSource.THREAD
+_NEVER_KEPT = ("os.fork()", "os.forkpty()")
 _ANSWERED = (NondeterminismSource.SOCKET, NondeterminismSource.PROCESS)
 # Patterns, compiled at their first use: few traces have such calls.
 _FOLDER = r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)"
@@ -77,16 +79,22 @@ def call_differences(
 
 
 def unrecorded_answer(run: ComparedTrace, view: EventSummary) -> UnrecordedAnswer | None:
-    """Return the last unrecorded answer of a socket or program, else of the C library, SQLite or a
-    device: in an event, else the last one before it in its node; None if there was none."""
+    """Return the last unrecorded answer of a socket or program, else of the C library, SQLite, a
+    device or real time: in an event, else the last one before it in its node; None if there was
+    none."""
     found = [f for f in (*_before(run, view), *_inside(run, view)) if f.mode is GuardMode.WARN]
     one = next((f for f in reversed(found) if f.source in _ANSWERED), None)
     if one is None:
-        one = next((f for f in reversed(found) if f.call.startswith(_UNSEEN)), None)
-        return UnrecordedAnswer(printable(one.call), one.place, "") if one else None
+        one = next((f for f in reversed(found) if _is_unseen(f)), None)
+        source = _THREAD.value if one is not None and one.source is _THREAD else ""
+        return UnrecordedAnswer(printable(one.call), one.place, source) if one else None
     call = one.call.removesuffix("()") + (f"({one.value})" if one.call.endswith("()") else "")
-    place = one.place
-    return UnrecordedAnswer(shortened(printable(call), _CALL_MAX), place, one.source.value)
+    source = "" if one.call in _NEVER_KEPT else one.source.value
+    return UnrecordedAnswer(shortened(printable(call), _CALL_MAX), one.place, source)
+
+
+def _is_unseen(finding: Finding) -> bool:
+    return finding.source is _THREAD or finding.call.startswith(_UNSEEN)
 
 
 def _inside(run: ComparedTrace, view: EventSummary | None) -> list[Finding]:
@@ -248,7 +256,8 @@ def answer_text(finding: Finding) -> str:
     try:
         value = json.loads(finding.value)
         value = value["then"] if isinstance(value, dict) and "of" in value else value
-        return _exit_text(value) if finding.call == "os.waitpid()" else _text(value)
+        text = _exit_text(value) if finding.call == "os.waitpid()" else _text(value)
+        return text.removeprefix("b") if finding.source is _ENVIRONMENT else text
     except (ValueError, TypeError, KeyError, IndexError, RecursionError):
         return finding.value
 

@@ -107,6 +107,9 @@ def _has(of: Judgement) -> tuple[str, str]:
     return ("a", "b") if of.b is None else ("b", "a")
 
 
+_THREAD = NondeterminismSource.THREAD.value
+
+
 # -- what happened ---------------------------------------------------------------------------------
 
 
@@ -118,11 +121,15 @@ def sentence_of(of: Judgement) -> str:
     if isinstance(of.what, EntityChanges):
         text = f"the graphs differ: {text}"
     if isinstance(of.likely, UnrecordedAnswer):
-        return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
+        return f"{text}; possible cause: {sentence(of.likely)}, which {_unrecorded(of.likely)}"
     if isinstance(of.likely, UnguardedCall):
         call = sentence(of.likely)
         return f"{text}; possible cause: {call}, which {of.likely.permission} lets differ"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
+
+
+def _unrecorded(answer: UnrecordedAnswer) -> str:
+    return "comes in real time" if answer.source == _THREAD else "is not recorded"
 
 
 @says(DivergenceKind.CONSTRUCTED_IN_ONE)
@@ -454,8 +461,9 @@ def cause_of(of: Judgement) -> str:
     text = sentence(of.why, of)
     if isinstance(of.likely, UnrecordedAnswer):
         source = of.likely.source
-        how = f" (to record it, set guard: {{{source}: record}} in the job)" if source else ""
-        text = f"{text}; {sentence(of.likely)} is not recorded{how}"
+        is_kept = source not in ("", _THREAD)
+        how = f" (to record it, set guard: {{{source}: record}} in the job)" if is_kept else ""
+        text = f"{text}; {sentence(of.likely)} {_unrecorded(of.likely)}{how}"
     elif isinstance(of.likely, UnguardedCall):
         count = of.likely.more
         more = f" and {count} more call{'s' if count > 1 else ''}" if count else ""
