@@ -526,7 +526,7 @@ RULES: dict[str, Rule] = {
     **_calls(ADDRESS, "numpy.lib.array_utils", "byte_bounds", reports=NondeterminismSource.ADDRESS),
     **_calls(_FILE_TIME, "os.path", "getmtime getatime getctime"),
     **_calls(_DISK, "os", "statvfs fstatvfs"),
-    **_calls(_DISK, "os", "readlink", restore=lambda answer: answer),
+    **_calls(_DISK, "os", "access readlink", restore=lambda answer: answer),
     **_calls(
         LOCALE,
         "locale",

@@ -485,3 +485,17 @@ def test_what_the_hash_seed_changes_is_a_possible_cause(
     cause = found.divergences[0].root_sentence
     assert f"environment.hash_seed (1, 2); a possible cause is {call}" in cause, cause
     assert found.divergences[0].next_step.startswith("rsltrace record ")
+
+
+def test_the_next_step_makes_a_constructor_again(
+    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = _TUNED.replace('"tuned", 10', 'os.environ["TOPIC"], 10').replace("BIAS", "1")
+    (tmp_path / "tuned.py").write_text("import os\n" + named)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for name in ("a", "b"):
+        monkeypatch.setenv("TOPIC", name)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    steps = diff_files("a.mcap", "b.mcap").divergences[0].next_step.split("; ")
+    assert all(command(*step.split()[1:]).returncode == 0 for step in steps)
+    assert "reproduces b" in command(*steps[1].split()[1:]).stdout

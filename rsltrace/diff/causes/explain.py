@@ -414,7 +414,7 @@ class Explainer:
             return f"rsltrace view {path_a} {path_b}"
         if self._has_other_settings(judgement):
             return f"rsltrace diff {path_a} {path_b} --all"
-        if judgement.root in _AGAIN and view.kind is not EventKind.CONSTRUCT:
+        if judgement.root in _AGAIN:
             record = record_again(self.run_a.trace)
             self.warnings.update(dict.fromkeys(record.warnings))
             if record.command:
@@ -503,7 +503,7 @@ _EXPLAINED = frozenset(
 )
 """Kinds of entities whose callbacks `rsltrace why` is asked about."""
 
-_AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
+_AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION, Root.JOB))
 """Roots of which recording the job again helps: it shows which run is the usual one."""
 
 _LINKS: dict[int, CauseLinkKind] = {
