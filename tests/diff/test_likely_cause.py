@@ -51,7 +51,7 @@ def told(calls: tuple[CallDifference, ...], *messages: MessageDifference) -> str
         ),
         (
             call("file", "os.stat(PosixPath('/x/gains.yaml'))", None, "4 bytes"),
-            "/picker read gains.yaml only in b at picker.py:24",
+            "/picker found gains.yaml only in b at picker.py:24",
         ),
         (
             call("directory", "os.listdir('/x/models')", "1 name (a)", "2 names (a, b)"),

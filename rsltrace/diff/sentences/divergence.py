@@ -107,6 +107,9 @@ def _has(of: Judgement) -> tuple[str, str]:
     return ("a", "b") if of.b is None else ("b", "a")
 
 
+_LOOKED_FOR = ("os.stat(", "os.lstat(")
+"""Calls that are findings only where there is such a file."""
+
 _THREAD = NondeterminismSource.THREAD.value
 
 
@@ -645,12 +648,19 @@ def _(cause: ExternalAnswers, of: object) -> str:
     return f"{text}; and {more} more" if more > 0 else text
 
 
+def no_answer(call: CallDifference) -> str:
+    """Return what stands for the answer in a run that has none."""
+    return "not found or not called" if call.call.startswith(_LOOKED_FOR) else "not called"
+
+
 def call_text(call: CallDifference) -> str:
     """Return ``read MOTOR_SEED (6 in a, 4 in b) at picker.py:24``."""
     done = f"{_CALLED.get(NondeterminismSource(call.source), 'called')} {printable(call.subject)}"
     place = call.where.partition(" in ")[0]
     at = f" at {place}" if place else ""
     if call.a is None or call.b is None:
+        if call.call.startswith(_LOOKED_FOR):
+            done = f"found {printable(call.subject)}"
         return f"{done} only in {'b' if call.a is None else 'a'}{at}"
     return f"{done} ({call.short[0]} in a, {call.short[1]} in b){at}"
 
