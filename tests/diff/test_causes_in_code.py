@@ -499,3 +499,25 @@ def test_the_next_step_makes_a_constructor_again(
     steps = diff_files("a.mcap", "b.mcap").divergences[0].next_step.split("; ")
     assert all(command(*step.split()[1:]).returncode == 0 for step in steps)
     assert "reproduces b" in command(*steps[1].split()[1:]).stdout
+
+
+_WAITS = """
+import os, time
+import rclpy
+def main():
+    rclpy.init()
+    node = rclpy.create_node("waits")
+    time.sleep(float(os.environ["WAIT"]))
+"""
+
+
+def test_what_a_main_read_once_it_had_a_node(
+    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "waits.py").write_text(_WAITS)
+    (tmp_path / "job.yaml").write_text("nodes: [{main: waits:main}]\nstop: {duration: 500ms}\n")
+    for name, seconds in (("a", "0.1"), ("b", "0.2")):
+        monkeypatch.setenv("WAIT", seconds)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    sentence = diff_files("a.mcap", "b.mcap").sentence
+    assert "read WAIT (0.1 in a, 0.2 in b) at waits.py:7" in sentence, sentence

@@ -118,7 +118,7 @@ def _before(run: ComparedTrace, view: EventSummary | None, other: str = "") -> l
 
 
 def _is_of(run: ComparedTrace, finding: Finding, node: str, view: EventSummary) -> bool:
-    if finding.node or node:
+    if node:
         return finding.node == node or (not finding.node and _has_made(run, finding, node))
     entity = run.trace.entities.get(finding.entity)
     return entity is not None and entity.kind is EntityKind.MAIN and entity.name == view.entity.name
