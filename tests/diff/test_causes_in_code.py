@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -464,27 +463,6 @@ def test_the_seed_is_the_cause_of_another_goal_id(
     for seed in (1, 2):
         assert command("record", "job.yaml", "--seed", seed, "-o", f"{seed}.mcap").returncode == 0
     assert cause("1.mcap", "2.mcap") == ["seed"]
-
-
-def test_what_the_hash_seed_changes_is_a_possible_cause(
-    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is named whatever is made of it; a third run shows that the seed decides."""
-    texts = "{'a', 'bb', 'ccc', 'dddd', 'eeeee'}"
-    made = f"sum(7**n * len(text) for n, text in enumerate({texts}))"
-    (tmp_path / "tuned.py").write_text(_TUNED.replace("BIAS", made))
-    job = "nodes: [{node: tuned:Tuned}]\nstop: {duration: 100ms}\nguard: false\n"
-    (tmp_path / "job.yaml").write_text(job)
-    for name in ("a", "b"):
-        monkeypatch.setenv("PYTHONHASHSEED", str("ab".index(name) + 1))
-        words = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", f"{name}.mcap"]
-        subprocess.run(words, cwd=tmp_path, check=True)
-    found = diff_files("a.mcap", "b.mcap")
-    call = f"order of the set {texts} at tuned.py:10"
-    assert f"; possible cause: {call}" in found.sentence, found.sentence
-    cause = found.divergences[0].root_sentence
-    assert f"environment.hash_seed (1, 2); a possible cause is {call}" in cause, cause
-    assert found.divergences[0].next_step.startswith("rsltrace record ")
 
 
 def test_the_next_step_makes_a_constructor_again(

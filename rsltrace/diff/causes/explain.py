@@ -406,7 +406,7 @@ class Explainer:
         assert view is not None
         path_a, path_b = (path_word(run.trace.name) for run in (self.run_a, self.run_b))
         verdict = judgement.verdict
-        if isinstance(judgement.likely, UnguardedCall) and judgement.is_unexplained:
+        if isinstance(judgement.likely, UnguardedCall):
             return f"rsltrace audit {path_word(judgement.likely.file)}"
         if verdict in (Verdict.ENDED_EARLY, Verdict.RAN_LONGER):
             return f"rsltrace info {path_b if verdict is Verdict.ENDED_EARLY else path_a}"

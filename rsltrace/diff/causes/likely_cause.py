@@ -96,8 +96,6 @@ def likely_cause(
         return properties
     if judgement.is_unexplained:
         return _unguarded_call(run, view, relevance.permissions) or unrecorded_answer(run, view)
-    if {setting.name for setting in judgement.settings} == {"hash_seed"}:  # what depends on it?
-        return _unguarded_call(run, view, relevance.permissions)
     return None
 
 
