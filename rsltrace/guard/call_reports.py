@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+import urllib.parse
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -388,6 +389,17 @@ def _content(name: str) -> str:
         return error.strerror or type(error).__name__
 
 
+def _database_report(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
+    name = os.fsdecode(arguments[0])
+    if not name or ":memory:" in name or "mode=memory" in name:
+        return None
+    file = urllib.parse.unquote(name[5:].partition("?")[0]) if name.startswith("file:") else name
+    # Closing a file drops the locks that other connections of this process hold on it.
+    in_use = any(os.path.exists(f"{file}{end}") for end in ("-journal", "-wal"))
+    value = "in use" if in_use else _content(file)
+    return NondeterminismSource.FILE, f"sqlite3.connect({file!r})", value
+
+
 def _foreign_function(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
     name = str(arguments[1])
     source = C_FUNCTIONS.get(name)
@@ -406,6 +418,7 @@ def _event_report(
 
 _HANDLERS: dict[str, Callable[[tuple[Any, ...], FrameType], _Report]] = {
     "open": _open_report,
+    "sqlite3.connect": _database_report,
     "ctypes.dlsym": _foreign_function,
     "ctypes.addressof": lambda arguments, frame: (
         NondeterminismSource.ADDRESS,

@@ -313,8 +313,8 @@ def sql_call(statement: str) -> tuple[str, Rule] | None:
     match = _SQL.search(statement)
     if match is None:
         return None
-    draws = match.group().lower().startswith("random")
-    return f"SQLite: {match.group()}", _SQL_RANDOM if draws else _SQL_CLOCK
+    call = match.group() + ")" * match.group().endswith("(")
+    return f"SQLite: {call}", _SQL_RANDOM if call.lower().startswith("random") else _SQL_CLOCK
 
 
 def _is_none(node: ast.expr) -> bool:
@@ -526,7 +526,7 @@ RULES: dict[str, Rule] = {
     **_calls(ADDRESS, "numpy.lib.array_utils", "byte_bounds", reports=NondeterminismSource.ADDRESS),
     **_calls(_FILE_TIME, "os.path", "getmtime getatime getctime"),
     **_calls(_DISK, "os", "statvfs fstatvfs"),
-    **_calls(_DISK, "os", "readlink", restore=lambda answer: answer),
+    **_calls(_DISK, "os", "access readlink", restore=lambda answer: answer),
     **_calls(
         LOCALE,
         "locale",

@@ -56,6 +56,7 @@ CALLS = [
     "os.cpu_count()",
     "pathlib.Path.home()",
     "os.path.getmtime('/')",
+    "os.access('/', os.R_OK)",
     "subprocess.run(['true'])",
     "os.system('true')",
     "socket.getaddrinfo('127.0.0.1', 80)",

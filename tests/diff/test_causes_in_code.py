@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -361,3 +363,139 @@ def test_what_the_c_library_answers_is_a_possible_cause(
     found = diff_files("a.mcap", "b.mcap")
     assert "; possible cause: the result of C library: getenv() at tuned.py:2" in found.sentence
     assert found.divergences[0].root_sentence.endswith("getenv() at tuned.py:2 is not recorded")
+
+
+_DATABASE = "import sqlite3\n"
+_FORKED = "os.fork() or os._exit(0)"
+_READ = "sqlite3.connect(%s).execute('select v from w').fetchone()[0]"
+
+
+def _write_database(path: Path, value: int) -> None:
+    path.unlink(missing_ok=True)
+    with closing(sqlite3.connect(path)) as made, made:
+        made.execute("create table w (v)")
+        made.execute("insert into w values (?)", (value,))
+
+
+@pytest.mark.parametrize("name", ["'w.db'", "'file:w.db?mode=ro', uri=True"])
+def test_a_database_is_a_file_that_was_read(
+    tmp_path: Path, command: Callable[..., Any], name: str
+) -> None:
+    (tmp_path / "tuned.py").write_text(_DATABASE + _TUNED.replace("BIAS", _READ % name))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for trace, value in (("a", 1), ("b", 2)):
+        _write_database(tmp_path / "w.db", value)
+        assert command("record", "job.yaml", "-o", f"{trace}.mcap").returncode == 0
+    found = diff_files("a.mcap", "b.mcap")
+    assert "; likely cause: /tuned read w.db" in found.sentence, found.sentence
+
+
+def test_a_database_in_use_is_not_read(tmp_path: Path, command: Callable[..., Any]) -> None:
+    """To open and close the file would drop the locks of the node's other connection."""
+    twice = "one, two = [sqlite3.connect('w.db').execute(sql) for sql in (INSERT, 'select 1')]\n"
+    insert = f"{_DATABASE}INSERT = 'insert into w values (2)'\n"
+    (tmp_path / "tuned.py").write_text(insert + twice + _TUNED.replace("BIAS", "1"))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 100ms}\n")
+    _write_database(tmp_path / "w.db", 1)
+    assert command("record", "job.yaml", "-o", "a.mcap").returncode == 0
+    with Trace.open("a.mcap") as trace:
+        values = [f.value for found in trace.answers.values() for f in found if "w.db" in f.call]
+    assert [value.partition(", ")[0] for value in values] == ["8192 bytes", "in use"]
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (
+            "signal.setitimer(signal.ITIMER_REAL, 0)",
+            "signal.setitimer() at tuned.py:11, which comes",
+        ),
+        (_FORKED, "os.fork() at tuned.py:11, which is not recorded"),
+    ],
+    ids=["timer", "fork"],
+)
+def test_what_happens_in_real_time_is_a_possible_cause(
+    tmp_path: Path,
+    command: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+    call: str,
+    told: str,
+) -> None:
+    node = "import os, signal\n" + _TUNED.replace("BIAS", f"FAULT + 0 * len([{call}])")
+    (tmp_path / "tuned.py").write_text(node)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 100ms}\n")
+    for name in ("a", "b"):
+        monkeypatch.setattr("builtins.FAULT", "ab".index(name), raising=False)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    found = diff_files("a.mcap", "b.mcap")
+    assert f"; possible cause: the result of {told}" in found.sentence, found.sentence
+    assert "{process: record}" not in found.divergences[0].root_sentence
+
+
+def test_what_sqlite_draws_is_a_possible_cause(tmp_path: Path, command: Callable[..., Any]) -> None:
+    drawn = "sqlite3.connect(':memory:').execute('select random()').fetchone()[0]"
+    (tmp_path / "tuned.py").write_text(_DATABASE + _TUNED.replace("BIAS", drawn))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for name in ("a", "b"):
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    sentence = diff_files("a.mcap", "b.mcap").sentence
+    assert "; possible cause: the result of SQLite: random() at tuned.py:" in sentence, sentence
+
+
+_GOALS = """
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from test_msgs.action import Fibonacci
+class Boss(Node):
+    def __init__(self):
+        super().__init__("boss")
+        self.client = ActionClient(self, Fibonacci, "plan")
+        self.create_timer(0.1, lambda: self.client.send_goal_async(Fibonacci.Goal(order=3)))
+"""
+
+
+def test_the_seed_is_the_cause_of_another_goal_id(
+    tmp_path: Path, command: Callable[..., Any]
+) -> None:
+    """rclpy draws it, in no code of the user."""
+    (tmp_path / "boss.py").write_text(_GOALS)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: boss:Boss}]\nstop: {duration: 100ms}\n")
+    for seed in (1, 2):
+        assert command("record", "job.yaml", "--seed", seed, "-o", f"{seed}.mcap").returncode == 0
+    assert cause("1.mcap", "2.mcap") == ["seed"]
+
+
+def test_the_next_step_makes_a_constructor_again(
+    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = _TUNED.replace('"tuned", 10', 'os.environ["TOPIC"], 10').replace("BIAS", "1")
+    (tmp_path / "tuned.py").write_text("import os\n" + named)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: tuned:Tuned}]\nstop: {duration: 500ms}\n")
+    for name in ("a", "b"):
+        monkeypatch.setenv("TOPIC", name)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    steps = diff_files("a.mcap", "b.mcap").divergences[0].next_step.split("; ")
+    assert all(command(*step.split()[1:]).returncode == 0 for step in steps)
+    assert "reproduces b" in command(*steps[1].split()[1:]).stdout
+
+
+_WAITS = """
+import os, time
+import rclpy
+def main():
+    rclpy.init()
+    node = rclpy.create_node("waits")
+    time.sleep(float(os.environ["WAIT"]))
+"""
+
+
+def test_what_a_main_read_once_it_had_a_node(
+    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "waits.py").write_text(_WAITS)
+    (tmp_path / "job.yaml").write_text("nodes: [{main: waits:main}]\nstop: {duration: 500ms}\n")
+    for name, seconds in (("a", "0.1"), ("b", "0.2")):
+        monkeypatch.setenv("WAIT", seconds)
+        assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
+    sentence = diff_files("a.mcap", "b.mcap").sentence
+    assert "read WAIT (0.1 in a, 0.2 in b) at waits.py:7" in sentence, sentence

@@ -136,6 +136,20 @@ def test_a_node_more_is_one_setting(tmp_path: Path) -> None:
     assert json.loads(b or "") == {"name": "camera", "node": "m:Camera", "on_exception": "stop"}
 
 
+def test_entries_that_changed_places_keep_their_settings(tmp_path: Path) -> None:
+    first, second = (
+        "  - node: m:Planner\n",
+        JOB[JOB.index("  - node: m:Ekf") :].partition("  - node: m:P")[0],
+    )
+    swapped = JOB.replace(second + first, first + second)
+    assert told(recorded(tmp_path), recorded(tmp_path, swapped)) == {
+        "robot.yaml:2: nodes": ("ekf, m:Planner", "m:Planner, ekf")
+    }
+    told_of_both = told(recorded(tmp_path), recorded(tmp_path, swapped.replace("50.0", "20.0")))
+    assert told_of_both["robot.yaml:5: nodes.ekf.parameters.rate"] == ("50.0", "20.0")
+    assert len(told_of_both) == 2
+
+
 def test_the_order_is_that_of_the_file(tmp_path: Path) -> None:
     options = ("stop.duration=3s", "seed=2", "nodes.ekf.parameters.frame=map")
     found = list(told(recorded(tmp_path), recorded(tmp_path, JOB, *options)))

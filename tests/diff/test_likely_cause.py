@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.diff.causes.calls import _paired, call_difference
+from rsltrace.diff.causes.calls import _paired, answer_text, call_difference
 from rsltrace.diff.causes.likely_cause import telling_calls
 from rsltrace.diff.facts.causes import ExternalAnswers
 from rsltrace.diff.facts.evidence import (
@@ -17,6 +17,7 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.diff.sentences import sentence
 from rsltrace.diff.sentences.divergence import call_text
+from rsltrace.guard.recorded_answers import encoded_answer
 from rsltrace.trace.model.finding import Finding, GuardMode, NondeterminismSource
 from rsltrace.trace.words.entities import EntityKey
 
@@ -50,7 +51,7 @@ def told(calls: tuple[CallDifference, ...], *messages: MessageDifference) -> str
         ),
         (
             call("file", "os.stat(PosixPath('/x/gains.yaml'))", None, "4 bytes"),
-            "/picker read gains.yaml only in b at picker.py:24",
+            "/picker found gains.yaml only in b at picker.py:24",
         ),
         (
             call("directory", "os.listdir('/x/models')", "1 name (a)", "2 names (a, b)"),
@@ -113,3 +114,18 @@ def test_calls_are_the_same_though_an_edit_has_moved_their_lines() -> None:
 
 def test_a_call_without_a_line_is_said_without_one() -> None:
     assert call_text(call("clock", "now()", None, "2", where="")) == "read now() only in b"
+
+
+def test_a_process_id_that_a_library_reads_too_is_not_told() -> None:
+    process = call("pid", "os.getpid()", "41", "42")
+    assert told((process, call("file", "open('/proc/stat')", "1 bytes", "2 bytes"))) == (
+        "/picker read stat (1 bytes in a, 2 bytes in b) at picker.py:24"
+    )
+    assert told((process,)) == "/picker read os.getpid() (41 in a, 42 in b) at picker.py:24"
+
+
+def test_a_recorded_variable_is_text() -> None:
+    source, mode = NondeterminismSource.ENVIRONMENT, GuardMode.RECORD
+    kept = encoded_answer(lambda: b"6")
+    found = Finding(3, 7, "/picker", source, mode, "os.environ['MOTOR_SEED']", kept, PLACE)
+    assert answer_text(found) == "'6'"

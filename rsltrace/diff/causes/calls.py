@@ -27,7 +27,10 @@ from rsltrace.trace.model.texts import contrasting_texts, printable, shortened
 CALLS_MAX = 20
 EARLIER_MAX = 3
 _CALL_MAX = 60
-_OF_C = "C library: "
+_UNSEEN = ("C library: ", "SQLite: ", "open('/dev/urandom')", "open('/dev/random')")
+"""What calls begin with whose answers no finding holds."""
+_ENVIRONMENT, _THREAD = NondeterminismSource.ENVIRONMENT, NondeterminismSource.THREAD
+_NEVER_KEPT = ("os.fork()", "os.forkpty()")
 _ANSWERED = (NondeterminismSource.SOCKET, NondeterminismSource.PROCESS)
 # Patterns, compiled at their first use: few traces have such calls.
 _FOLDER = r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)"
@@ -76,16 +79,22 @@ def call_differences(
 
 
 def unrecorded_answer(run: ComparedTrace, view: EventSummary) -> UnrecordedAnswer | None:
-    """Return the last unrecorded answer of a socket, a program or the C library: in an event, else
-    the last one before it in its node; None if there was none."""
+    """Return the last unrecorded answer of a socket or program, else of the C library, SQLite, a
+    device or real time: in an event, else the last one before it in its node; None if there was
+    none."""
     found = [f for f in (*_before(run, view), *_inside(run, view)) if f.mode is GuardMode.WARN]
     one = next((f for f in reversed(found) if f.source in _ANSWERED), None)
     if one is None:
-        of_c = next((f for f in reversed(found) if f.call.startswith(_OF_C)), None)
-        return UnrecordedAnswer(printable(of_c.call), of_c.place, "") if of_c else None
+        one = next((f for f in reversed(found) if _is_unseen(f)), None)
+        source = _THREAD.value if one is not None and one.source is _THREAD else ""
+        return UnrecordedAnswer(printable(one.call), one.place, source) if one else None
     call = one.call.removesuffix("()") + (f"({one.value})" if one.call.endswith("()") else "")
-    place = one.place
-    return UnrecordedAnswer(shortened(printable(call), _CALL_MAX), place, one.source.value)
+    source = "" if one.call in _NEVER_KEPT else one.source.value
+    return UnrecordedAnswer(shortened(printable(call), _CALL_MAX), one.place, source)
+
+
+def _is_unseen(finding: Finding) -> bool:
+    return finding.source is _THREAD or finding.call.startswith(_UNSEEN)
 
 
 def _inside(run: ComparedTrace, view: EventSummary | None) -> list[Finding]:
@@ -109,7 +118,7 @@ def _before(run: ComparedTrace, view: EventSummary | None, other: str = "") -> l
 
 
 def _is_of(run: ComparedTrace, finding: Finding, node: str, view: EventSummary) -> bool:
-    if finding.node or node:
+    if node:
         return finding.node == node or (not finding.node and _has_made(run, finding, node))
     entity = run.trace.entities.get(finding.entity)
     return entity is not None and entity.kind is EntityKind.MAIN and entity.name == view.entity.name
@@ -247,7 +256,8 @@ def answer_text(finding: Finding) -> str:
     try:
         value = json.loads(finding.value)
         value = value["then"] if isinstance(value, dict) and "of" in value else value
-        return _exit_text(value) if finding.call == "os.waitpid()" else _text(value)
+        text = _exit_text(value) if finding.call == "os.waitpid()" else _text(value)
+        return text.removeprefix("b") if finding.source is _ENVIRONMENT else text
     except (ValueError, TypeError, KeyError, IndexError, RecursionError):
         return finding.value
 

@@ -414,7 +414,9 @@ class Explainer:
             return f"rsltrace view {path_a} {path_b}"
         if self._has_other_settings(judgement):
             return f"rsltrace diff {path_a} {path_b} --all"
-        if judgement.root in _AGAIN and view.kind is not EventKind.CONSTRUCT:
+        lacking = self._lacks_callback(judgement)
+        is_in_one = lacking is None and judgement.root in (Root.MISSING, Root.EXTRA)
+        if judgement.root in _AGAIN or is_in_one:
             record = record_again(self.run_a.trace)
             self.warnings.update(dict.fromkeys(record.warnings))
             if record.command:
@@ -422,7 +424,7 @@ class Explainer:
                 until = seconds_text(self.run_a.trace.stamp(last))
                 again = f"{record.command} --until {until} -o again.mcap --force"
                 return f"{again}; rsltrace diff {path_a} {path_b} --again again.mcap"
-        if (lacking := self._lacks_callback(judgement)) is not None:
+        if lacking is not None:
             name = shlex.quote(view.entity.name)
             since = seconds_text(lacking.stamp(view.stamp_ns))
             of = f"{path_word(lacking.name)} {shlex.quote(view.entity.node)} {name}"
@@ -503,7 +505,7 @@ _EXPLAINED = frozenset(
 )
 """Kinds of entities whose callbacks `rsltrace why` is asked about."""
 
-_AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
+_AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION, Root.JOB))
 """Roots of which recording the job again helps: it shows which run is the usual one."""
 
 _LINKS: dict[int, CauseLinkKind] = {

@@ -16,6 +16,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+from rsltrace.diff.causes.job_entries import TARGETS
 from rsltrace.diff.causes.record_command import is_effective, is_of_file, job_file
 from rsltrace.diff.causes.relevance import resolved_job
 from rsltrace.diff.facts.evidence import Setting, SettingKind
@@ -255,6 +256,15 @@ def _holds_parts(a: list[Any], b: list[Any]) -> bool:
 def _changed_entries(
     path_a: KeyPath, path_b: KeyPath, a: list[Any], b: list[Any]
 ) -> Iterator[_Change]:
+    names_a, names_b = ([_entry_name(item) for item in side] for side in (a, b))
+    if names_a != names_b and sorted(names_a) == sorted(names_b) == sorted({*names_a}):
+        moved = [n for n, (x, y) in enumerate(zip(names_a, names_b, strict=True)) if x != y]
+        orders = (", ".join(side[n] for n in moved) for side in (names_a, names_b))
+        yield _Change(path_a, path_b, *((order,) for order in orders))
+        for at_a, name in enumerate(names_a):
+            at_b = names_b.index(name)
+            yield from _changes((*path_a, at_a), (*path_b, at_b), a[at_a], b[at_b])
+        return
     if len(a) == len(b):
         changes = [(0, len(a), 0, len(b))]
     else:
@@ -270,6 +280,13 @@ def _changed_entries(
             yield _Change((*path_a, at_a), (*path_b, at_a), (a[at_a],), None)
         for at_b in sorted({*range(begin_b, end_b)} - {begin_b + at for _, at in pairs}):
             yield _Change((*path_a, at_b), (*path_b, at_b), None, (b[at_b],))
+
+
+def _entry_name(entry: Any) -> str:
+    """Return what tells an entry of a list from the others: its name, what it runs or reads."""
+    if not isinstance(entry, dict):
+        return json.dumps(entry)
+    return next((str(entry[key]) for key in ("name", *TARGETS, "path") if entry.get(key)), "")
 
 
 def _most_alike(a: list[Any], b: list[Any]) -> list[tuple[int, int]]:

@@ -82,14 +82,21 @@ def likely_cause(
     if may_cause and may_cause[0].differs:
         changed = judgement.changed
         subject = subject_of(view) if changed is None else changed.node
-        return ExternalAnswers(subject, telling_calls(may_cause, judgement.messages))
+        telling = telling_calls(may_cause, judgement.messages)
+        if all(map(_is_bookkeeping, telling)) and not _answers(telling) & _shown(
+            judgement.messages
+        ):
+            unrecorded = unrecorded_answer(run, view)
+            if unrecorded is not None:
+                return unrecorded
+        return ExternalAnswers(subject, telling)
     if (found := _set_behind(run, view, judgement.messages, calls, relevance)) is not None:
         return found
     if (properties := changed_properties(judgement, runs)) is not None:
         return properties
-    if not judgement.is_unexplained:
-        return None
-    return _unguarded_call(run, view, relevance.permissions) or unrecorded_answer(run, view)
+    if judgement.is_unexplained:
+        return _unguarded_call(run, view, relevance.permissions) or unrecorded_answer(run, view)
+    return None
 
 
 def suppressed_exception(
@@ -135,8 +142,8 @@ def telling_calls(
     differing = [c for c in differing if not c.only_touched] or differing
     if len(differing) > 1:
         shown = _shown(messages)
-        telling = [c for c in differing if {unquoted(v) for v in (c.a, c.b) if v} & shown]
-        differing = telling or differing
+        telling = [c for c in differing if _answers((c,)) & shown]
+        differing = telling or [c for c in differing if not _is_bookkeeping(c)] or differing
     programs = {c.where: c.call for c in calls if c.call.startswith(STARTED_BY)}
     return tuple(
         replace(c, call=programs[c.where], subject=subject_of_call(c.source, programs[c.where]))
@@ -144,6 +151,15 @@ def telling_calls(
         else c
         for c in differing
     )
+
+
+def _is_bookkeeping(call: CallDifference) -> bool:
+    """Whether it asks for the process id, which libraries compare with that of before a fork."""
+    return call.source == NondeterminismSource.PID.value
+
+
+def _answers(calls: Sequence[CallDifference]) -> set[str]:
+    return {unquoted(value) for call in calls for value in (call.a, call.b) if value}
 
 
 def _shown(messages: Sequence[MessageDifference]) -> set[str]:

@@ -204,12 +204,19 @@ class Relevance:
             return not place.inside
         if any(job.get("clocks") for job in self._jobs) or not all(map(_is_guarded, self._jobs)):
             return True
-        return any(
-            count.source is NondeterminismSource.RANDOM
-            and (not place.nodes or count.node in place.nodes)
+        drawing = {
+            count.node
             for trace in self._traces
             for count in trace.guarded
-        )
+            if count.source is NondeterminismSource.RANDOM
+        }
+        drawing |= {  # rclpy draws the ids of an action client's goals
+            trace.entities.get(entity.node, entity).name
+            for trace in self._traces
+            for entity in trace.entities.values()
+            if entity.kind is EntityKind.CLIENT and "action" in entity.detail
+        }
+        return not drawing.isdisjoint(place.nodes or drawing)
 
     def _is_of_the_graph(self, setting: Setting, rest: Sequence[str]) -> bool:
         """Whether a delay is of a topic or service that there is."""

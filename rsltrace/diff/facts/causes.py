@@ -359,7 +359,7 @@ class ErrorInTransition(Fact):
 @dataclass(frozen=True, slots=True)
 class UnrecordedAnswer(Fact):
     """An unrecorded external answer: a possible cause. ``source`` is the key of
-    ``guard:`` that keeps it, "" if none does."""
+    ``guard:`` that keeps it, "" if none does, ``thread`` of what happens in real time."""
 
     call: str
     place: str

@@ -26,7 +26,7 @@ from rsltrace.diff.report.line import (
 )
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.row_sign import RowSign
-from rsltrace.diff.sentences.divergence import no_event_text
+from rsltrace.diff.sentences.divergence import no_answer, no_event_text
 from rsltrace.diff.sentences.event_differences import event_differences_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
@@ -161,7 +161,7 @@ def _calls(found: Divergence, width: int) -> Section:
         if call.a == call.b:
             rows.append(cut(line("  ", mark, what), width))
         else:
-            a, b = ("not called" if v is None else printable(v) for v in (call.a, call.b))
+            a, b = (no_answer(call) if v is None else printable(v) for v in (call.a, call.b))
             if len(what) + len(a) + len(b) + 28 <= width:
                 pair = ((a, Style.SIDE_A), ("  |  ", Style.FAINT), (b, Style.SIDE_B))
                 rows.append(cut(line("  ", mark, f"{what}  ", *pair), width))

@@ -107,6 +107,12 @@ def _has(of: Judgement) -> tuple[str, str]:
     return ("a", "b") if of.b is None else ("b", "a")
 
 
+_LOOKED_FOR = ("os.stat(", "os.lstat(")
+"""Calls that are findings only where there is such a file."""
+
+_THREAD = NondeterminismSource.THREAD.value
+
+
 # -- what happened ---------------------------------------------------------------------------------
 
 
@@ -118,11 +124,15 @@ def sentence_of(of: Judgement) -> str:
     if isinstance(of.what, EntityChanges):
         text = f"the graphs differ: {text}"
     if isinstance(of.likely, UnrecordedAnswer):
-        return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
+        return f"{text}; possible cause: {sentence(of.likely)}, which {_unrecorded(of.likely)}"
     if isinstance(of.likely, UnguardedCall):
         call = sentence(of.likely)
         return f"{text}; possible cause: {call}, which {of.likely.permission} lets differ"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
+
+
+def _unrecorded(answer: UnrecordedAnswer) -> str:
+    return "comes in real time" if answer.source == _THREAD else "is not recorded"
 
 
 @says(DivergenceKind.CONSTRUCTED_IN_ONE)
@@ -454,10 +464,12 @@ def cause_of(of: Judgement) -> str:
     text = sentence(of.why, of)
     if isinstance(of.likely, UnrecordedAnswer):
         source = of.likely.source
-        how = f" (to record it, set guard: {{{source}: record}} in the job)" if source else ""
-        text = f"{text}; {sentence(of.likely)} is not recorded{how}"
+        is_kept = source not in ("", _THREAD)
+        how = f" (to record it, set guard: {{{source}: record}} in the job)" if is_kept else ""
+        text = f"{text}; {sentence(of.likely)} {_unrecorded(of.likely)}{how}"
     elif isinstance(of.likely, UnguardedCall):
-        more = f" and {of.likely.more} more calls" if of.likely.more else ""
+        count = of.likely.more
+        more = f" and {count} more call{'s' if count > 1 else ''}" if count else ""
         permission = f", which {of.likely.permission} lets differ"
         text = f"{text}; a possible cause is {sentence(of.likely)}{more}{permission}"
     elif isinstance(of.likely, ErrorInTransition):
@@ -636,12 +648,19 @@ def _(cause: ExternalAnswers, of: object) -> str:
     return f"{text}; and {more} more" if more > 0 else text
 
 
+def no_answer(call: CallDifference) -> str:
+    """Return what stands for the answer in a run that has none."""
+    return "not found or not called" if call.call.startswith(_LOOKED_FOR) else "not called"
+
+
 def call_text(call: CallDifference) -> str:
     """Return ``read MOTOR_SEED (6 in a, 4 in b) at picker.py:24``."""
     done = f"{_CALLED.get(NondeterminismSource(call.source), 'called')} {printable(call.subject)}"
     place = call.where.partition(" in ")[0]
     at = f" at {place}" if place else ""
     if call.a is None or call.b is None:
+        if call.call.startswith(_LOOKED_FOR):
+            done = f"found {printable(call.subject)}"
         return f"{done} only in {'b' if call.a is None else 'a'}{at}"
     return f"{done} ({call.short[0]} in a, {call.short[1]} in b){at}"
 

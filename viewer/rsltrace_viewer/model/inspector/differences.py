@@ -19,7 +19,7 @@ from rsltrace.diff.facts.remarks import EndedByException
 from rsltrace.diff.report.differences import distance_text
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.row_sign import RowSign
-from rsltrace.diff.sentences.divergence import no_event_text
+from rsltrace.diff.sentences.divergence import no_answer, no_event_text
 from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.errors import TraceError
@@ -77,7 +77,7 @@ def differing_call_lines(calls: Sequence[CallDifference]) -> Iterator[Line]:
         yield Line(0, "≠ call", f"{call.source}: {printable(call.call)}", Role.SECTION, path)
         yield Line(1, "at", printable(call.where), Role.NOTE, f"{path}.at")
         for name, value, event in (("a", call.a, call.event_a), ("b", call.b, call.event_b)):
-            text = "not called" if value is None else shortened(printable(value), _VALUE_MAX)
+            text = no_answer(call) if value is None else shortened(printable(value), _VALUE_MAX)
             link = event if value is not None else None
             yield Line(
                 1, name, text, Role.FIELD, f"{path}.{name}", link=link, other_run=name == "b"
