@@ -204,12 +204,16 @@ class Relevance:
             return not place.inside
         if any(job.get("clocks") for job in self._jobs) or not all(map(_is_guarded, self._jobs)):
             return True
-        return any(
-            count.source is NondeterminismSource.RANDOM
-            and (not place.nodes or count.node in place.nodes)
+        drawing = {
+            count.node
             for trace in self._traces
             for count in trace.guarded
-        )
+            if count.source is NondeterminismSource.RANDOM
+        }
+        for trace in self._traces:  # rclpy, whose calls are not counted, draws the IDs of goals
+            goals = [e for e in trace.entities.values() if e.name.endswith("/_action/send_goal")]
+            drawing.update(trace.node_of(e).name for e in goals if e.kind is EntityKind.CLIENT)
+        return not drawing.isdisjoint(place.nodes or drawing)
 
     def _is_of_the_graph(self, setting: Setting, rest: Sequence[str]) -> bool:
         """Whether a delay is of a topic or service that there is."""
