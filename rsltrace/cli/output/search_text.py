@@ -14,6 +14,7 @@ from rsltrace.diff.report import render
 from rsltrace.search.explore.search import Explorer, SearchTally
 from rsltrace.search.explore.small.causes import FAILING, JOB, PASSING, PASSING_JOB
 from rsltrace.search.explore.trial import JobSource, TrialResult
+from rsltrace.trace.model.texts import counted
 
 if TYPE_CHECKING:
     from rsltrace.diff.result import Diff
@@ -138,8 +139,8 @@ def search_lines(
     tally = search.tally
     failed = sum(tally.failures.values())
     yield (
-        f"{_counted(tally.runs, 'run')}, {_counted(len(tally.digests), 'different digest')}, "
-        f"{failed} failed" + (f" of {_counted(len(tally.failures), 'cause')}" if failed else "")
+        f"{counted(tally.runs, 'run')}, {counted(len(tally.digests), 'different digest')}, "
+        f"{failed} failed" + (f" of {counted(len(tally.failures), 'cause')}" if failed else "")
     )
     if caution:
         yield caution
@@ -149,13 +150,13 @@ def search_lines(
         yield from _cause(tally.first[key], tally.failures[key], source)
     more = len(tally.failures) - _CAUSES_MAX
     if more > 0:
-        yield f"and {_counted(more, 'more cause')}"
+        yield f"and {counted(more, 'more cause')}"
     if not quiet:
         yield from search.strategy.coverage()
         if tally.forked:
-            yield f"{_counted(tally.forked, 'run')} forked from the default run"
+            yield f"{counted(tally.forked, 'run')} forked from the default run"
         for why, count in tally.not_forked.most_common():
-            yield f"{_counted(count, 'run')} run from the start: {why}"
+            yield f"{counted(count, 'run')} run from the start: {why}"
     if search.is_exhausted:
         yield "every run has been tried"
     yield f"results: {folder}; report: {folder / 'report.html'}"
@@ -172,7 +173,7 @@ def flaky_lines(
 ) -> Iterator[str]:
     """Yield the lines of what a search found about a test; ``small`` are its minimized failures."""
     tally = search.tally
-    runs = f"{_counted(tally.runs, 'run')}, {_counted(len(tally.digests), 'different order')}"
+    runs = f"{counted(tally.runs, 'run')}, {counted(len(tally.digests), 'different order')}"
     failed = sum(tally.failures.values())
     yield f"it failed in {failed} of {runs}" if failed else f"it never failed in {runs}"
     if failed and failed == tally.runs:
@@ -182,7 +183,7 @@ def flaky_lines(
     for key in _by_frequency(tally)[:_CAUSES_MAX]:
         failure, count, one = tally.first[key].failure, tally.failures[key], small.get(key)
         assert failure is not None
-        yield f"{failure.kind}, {_counted(count, 'run')}: {key}"
+        yield f"{failure.kind}, {counted(count, 'run')}: {key}"
         yield from (f"  {line}" for line in failure.text.splitlines()[:_FAILURE_LINES_MAX])
         if one is None or one.trouble:
             yield f"  not minimized: {one.trouble if one else 'interrupted'}"
@@ -208,12 +209,8 @@ def _cause(result: TrialResult, count: int, source: JobSource) -> Iterator[str]:
     text = failure.text.splitlines()[0]
     text = text if len(text) <= _TEXT_MAX else f"{text[:_TEXT_MAX]}…"
     yield f"{failure.kind}: {text}"
-    yield f"  {_counted(count, 'run')}, first trial {trial.number}: {trial.why}"
+    yield f"  {counted(count, 'run')}, first trial {trial.number}: {trial.why}"
     if result.trace is not None and Path(result.trace).is_file():
         at = f" --at {failure.event}" if failure.event is not None else ""
         yield f"  view: rsltrace view {shlex.quote(result.trace)}{at}"
     yield f"  reproduce: {source.command(trial)}"
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'s' * (count != 1)}"

@@ -80,9 +80,9 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
     if not (found or is_topic or asked.startswith("/")):  # a name in the namespace of the node
         found = [one for one in there if f"{topic}/" in f"{one.name}/"]
     if len({filter_of(e) or (e.kind, e.name, e.detail.get("callback")) for e in found}) > 1:
-        names = [": ".join(dict.fromkeys((e.name, _callbacks(e)[-1]))) for e in found]
+        titles = [": ".join(dict.fromkeys((e.name, _callbacks(e)[-1]))) for e in found]
         listed = ", ".join(
-            f"{e.id} ({e.kind.label} {name})" for e, name in zip(found, names, strict=True)
+            f"{e.id} ({e.kind.label} {title})" for e, title in zip(found, titles, strict=True)
         )
         text = f"{called[0]} has several {asked}; give a number: {listed}"
         raise TraceError(printable(text))

@@ -26,7 +26,7 @@ from rsltrace.search.history.run_record import DIRTY, READER, SUFFIX, RunRecord
 from rsltrace.trace.mcap.open import open_source
 from rsltrace.trace.mcap.remote import filesystem_of
 from rsltrace.trace.mcap.source import ByteSource, public_address, redacted
-from rsltrace.trace.model.texts import printable, shortened
+from rsltrace.trace.model.texts import counted, printable, shortened
 from rsltrace.trace.words.phrases import path_word, table
 
 SHOWN_MAX = 100
@@ -353,11 +353,6 @@ def summary_line(found: HistorySummary) -> str:
         f"{counted(found.runs, 'run')} of {counted(found.jobs_count, 'job')} at "
         f"{counted(found.commits_count, 'commit')}, {found.first[:10]} to {found.last[:10]}"
     )
-
-
-def counted(count: int, what: str) -> str:
-    """Return a number of things."""
-    return f"{count:,} {what}{'s' * (count != 1)}"
 
 
 def change_cells(one: DigestChange) -> tuple[str, ...]:

@@ -78,6 +78,11 @@ def format_milliseconds(duration_ns: int | None) -> str:
     return f"{duration_ns / 1e6:.{4 if abs(duration_ns) < 10 * NS_PER_S else 9}g}"
 
 
+def counted(count: int, what: str) -> str:
+    """Return a number of things: ``1 run``, ``2,000 runs``."""
+    return f"{count:,} {what}{'s' * (count != 1)}"
+
+
 def contrasting(a: Any, b: Any, text: Callable[[Any, int], Text]) -> tuple[Text, Text]:
     """Return two values with as many digits as it takes to see the difference; ``text`` returns a
     value rounded to some digits."""

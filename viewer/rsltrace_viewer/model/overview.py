@@ -77,9 +77,9 @@ class Met:
 class Overview:
     """Counts of a run, so far: ``share`` of it is read (0 to 1). Keys are ids of entities.
 
-    ``starts`` are the events in which a callback begins, ``sent`` counts the messages of publishers, ``waited`` is how long messages were on their way,
-    ``took`` how long callbacks took, where the job gives them execution times, ``paused`` how long
-    they waited themselves, in a call or a sleep.
+    ``starts`` are events in which callbacks begin, ``sent`` counts the messages of publishers,
+    ``waited`` is how long messages were on their way, ``took`` how long callbacks took, where the
+    job gives them execution times, ``paused`` how long they waited themselves.
     """
 
     events: dict[int, Occurrences] = field(default_factory=dict)

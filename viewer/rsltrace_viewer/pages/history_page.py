@@ -8,10 +8,10 @@ from rsltrace.search.history.summary import (
     bisect_command,
     change_cells,
     commit_text,
-    counted,
     job_cells,
     summary_line,
 )
+from rsltrace.trace.model.texts import counted
 from rsltrace_viewer.pages.page import render_page
 
 

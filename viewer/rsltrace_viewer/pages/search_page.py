@@ -54,7 +54,7 @@ def exploration_page(explored: Exploration) -> str:
         (f"{len(explored.failed):,}", "failed"),
         (f"{len(causes(explored)):,}", "causes"),
         (f"{explored.digests:,}", "different digests"),
-        (format_duration(round(explored.wall_s * 1e9)), "of real time"),
+        (format_duration(explored.wall_s * 1e9, 3), "of real time"),
         (f"{rate:.1f}", "runs per second"),
         (explored.strategy or "-", "strategy"),
     )
