@@ -18,7 +18,7 @@ from rsltrace.cli.output.exit_status import tell_error
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, RunError
 from rsltrace.terminal import say, tell, tell_notes
-from rsltrace.trace.model.texts import format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import counted, format_duration, format_seconds, printable
 from rsltrace.trace.words.phrases import notes_on, table
 
 if TYPE_CHECKING:
@@ -284,14 +284,13 @@ def _line(one: AuditFinding) -> str:
 
 
 def _summary(result: AuditReport, found: Sequence[AuditFinding]) -> str:
-    files = f"{result.files} file{'s' * (result.files != 1)}"
+    files = counted(result.files, "file")
     silenced = f"; {result.allowed} allowed by a comment" if result.allowed else ""
     if not found:
         return f"nothing found in {files}{silenced}"
     counts = Counter(one.treatment.value for one in found)
     treated = ", ".join(f"{counts[name]} {name}" for name in counts)
-    many = f"{len(found)} finding{'s' * (len(found) != 1)}"
-    return f"{many} in {files} (guard: {treated}){silenced}"
+    return f"{counted(len(found), 'finding')} in {files} (guard: {treated}){silenced}"
 
 
 def _as_json(result: AuditReport, found: Sequence[AuditFinding]) -> str:

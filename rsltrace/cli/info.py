@@ -342,7 +342,7 @@ def _entity_lines(
                 printable(entity.type) or "-",
                 str(_count(counts.events, entity.id)),
                 str(_count(counts.outputs, entity.id)),
-                "-" if rate is None else f"{rate:.6g}",
+                "-" if rate is None else f"{rate:.4g}",
                 printable(places_text(entity_places(trace, entity), ", ")) or "-",
             )
         )

@@ -109,7 +109,9 @@ class Supervisor:
         if name is not None:
             return str(self.tree.ask_cursor({"do": "node name", "name": name}))
         event = self.tree.position.get("next") or self.tree.position["event"]
-        if event is None or not event["node"]:
+        if event is None:
+            raise DebugError("nothing has run yet: give a node (next ekf)")
+        if not event["node"]:
             raise DebugError("this event belongs to no node: give a node")
         return str(event["node"])
 
@@ -161,7 +163,7 @@ class Supervisor:
         while hit is not None and hit["text"].endswith(f"-> {NOT_THERE}"):  # the node was destroyed
             hit = self.tree.last_hit({"breakpoints": conditions}, int(hit["index"]))
         if hit is None:
-            raise DebugError(f"{request['attribute']} of {name} has not changed so far")
+            raise DebugError(f"{name} has had no attribute {request['attribute']} so far")
         return dict(hit["position"])
 
     def _first_true(self, request: Message) -> Message:

@@ -84,6 +84,10 @@ class RunningEntry(threading.Thread):
         running = self._recorder.stacks
         return next((one.ident for one in pool if running.get(one.ident)), None)
 
+    def is_idle(self) -> bool:
+        """Whether no callback of it runs any more."""
+        return self.busy is None
+
     def _construct(self) -> None:
         recorder = self._recorder
         recorder.begin(int(EventKind.CONSTRUCT), None)

@@ -157,7 +157,7 @@ class SingleProcessRun(NativeRun):
         patience = Patience(ENDS_WITHIN_S)
         for one in self._running:
             patience.wait_for_end(one)
-            patience.wait(time.sleep, lambda one=one: not one.busy)  # threads of its executor
+            patience.wait(time.sleep, one.is_idle)
         stuck = {one.entry.name: place_of(one.busy) for one in self._running if one.busy}
         ended_after = self.recorder.count
         for one in self._running:

@@ -67,7 +67,8 @@ class TraceCounts:
         return series.rate_hz if series else None
 
 
-_CONTINUES = (EventKind.TASK, EventKind.RESUME)
+CONTINUES = (EventKind.TASK, EventKind.RESUME)
+"""Events in which a callback that has begun goes on."""
 
 
 def count_trace(trace: Trace) -> TraceCounts:
@@ -79,7 +80,7 @@ def count_trace(trace: Trace) -> TraceCounts:
     for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
         stamps = events["stamp"]
         add_occurrences(counts.events, events["entity"], stamps)
-        starts = ~np.isin(events["kind"], _CONTINUES)
+        starts = ~np.isin(events["kind"], CONTINUES)
         add_occurrences(counts.starts, events["entity"][starts], stamps[starts])
         own = outputs[outputs["kind"] != _ENTITY]
         owners = (own["event"] - events["index"][0]).astype(np.intp)

@@ -102,6 +102,8 @@ def test_next_and_reverse_next_stay_in_a_node(session: DebugSession) -> None:
 
 
 def test_next_is_of_the_node_whose_event_is_about_to_run(session: DebugSession) -> None:
+    with pytest.raises(DebugError, match="nothing has run yet: give a node"):
+        session.next()
     session.run_to(200)
     session.break_at("node /watch")
     here = session.go_on().position
@@ -176,7 +178,7 @@ def test_who_changed_sent_and_when_it_became_true(session: DebugSession) -> None
     made = session.last_changed("filter", "warned")
     assert made.event is not None
     assert made.event["kind"] == "construct"
-    with pytest.raises(DebugError, match="has not changed"):
+    with pytest.raises(DebugError, match="/filter has had no attribute nothing so far"):
         session.last_changed("filter", "nothing")
     session.go_on()  # to the end, where the node is gone
     assert session.last_changed("filter", "warned") == changed

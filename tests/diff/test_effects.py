@@ -91,7 +91,7 @@ def test_a_parameter_and_what_it_did(recorded: Callable[..., Path]) -> None:
     assert diff.agreeing == diff.divergences[0].a.index == 1  # type: ignore[union-attr]
     assert diff.sentence == (
         "parameter speed 1.0 → 1.5 (job.yaml:6); first effect: /follower published a different "
-        "linear.x and 1 more field on /cmd_vel at 0.1 s (linear.x 2.0 → 3.0 and 1 more field)"
+        "linear.x on /cmd_vel at 0.1 s (linear.x 2.0 → 3.0 and 1 more field)"
     )
     other = rsltrace.diff(b, a).sentence
     assert other.startswith("parameter speed 1.5 → 1.0 (job.yaml:6); first effect: /follower pub")
@@ -194,7 +194,7 @@ def make(speed):
         run(rsltrace.load_job(job), traces[-1])
     assert rsltrace.diff(*traces).sentence == (
         "setting nodes.0.arguments.speed 1.0 → 1.5 (job.yaml:1); first effect: /follower published "
-        "a different linear.x and 1 more field on /cmd_vel at 0.1 s (linear.x 2.0 → 3.0 and 1 more "
+        "a different linear.x on /cmd_vel at 0.1 s (linear.x 2.0 → 3.0 and 1 more "
         "field)"
     )
 

@@ -22,9 +22,11 @@ NODES = '''
 import os
 import random
 
+from rclpy.action import ActionClient
 from rclpy.node import Node
 from std_msgs.msg import Float64, UInt64
 from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
 MODE = os.environ.get("FAULTY_MODE", "")  # what no trace tells: a hidden input
 AT = int(os.environ.get("FAULTY_AT", "7"))
@@ -37,6 +39,7 @@ class Sensor(Node):
         super().__init__("sensor")
         self.declare_parameter("gain", 1.0)
         self.publisher = self.create_publisher(Float64, "reading", 10)
+        self.goals = ActionClient(self, Fibonacci, "count") if MODE == "goal" else None
         self.count = 0
         self.timer = self.create_timer(0.1, self.tick)
 
@@ -58,6 +61,8 @@ class Sensor(Node):
             self.publisher.publish(Float64(data=value))
         if MODE == "random":
             self.publisher.publish(Float64(data=random.random()))
+        if self.goals:
+            self.goals.send_goal_async(Fibonacci.Goal())
 
 
 class Filter(Node):
@@ -242,8 +247,9 @@ def test_another_parameter(diffed: Callable[..., Diff]) -> None:
     assert diff.effect.root_sentence == first.root_sentence
 
 
-def test_another_seed(diffed: Callable[..., Diff]) -> None:
-    diff = diffed(both="random", seed=1)
+@pytest.mark.parametrize("mode", ["random", "goal"])  # rclpy draws the IDs of goals
+def test_another_seed(diffed: Callable[..., Diff], mode: str) -> None:
+    diff = diffed(both=mode, seed=1)
     (first,) = diff.divergences
     assert (diff.verdict, first.root) == (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK)
     assert first.a is not None

@@ -62,6 +62,7 @@ from rsltrace.diff.facts.remarks import (
 )
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import FORMATS, render
+from rsltrace.diff.report.differences import payload_lines
 from rsltrace.diff.result import BagDiff, ComparedRun, Diff, Divergence, EntityCount
 from rsltrace.diff.row_sign import RowSign
 from rsltrace.errors import TraceError
@@ -466,6 +467,10 @@ def test_of_many_topics_as_many_are_shown_as_two_lines_hold(width: int, shown: i
     affects = " ".join(text[text.index("affects /t0") :].split())
     assert affects.count(" immediately, ", 0, affects.index("more")) == shown
     assert f" immediately, and {5000 - shown} more" in affects
+
+
+def test_one_more_field_is_no_plural() -> None:
+    assert "… 1 more field " in f"{payload_lines((), 1, '', '', 80)} ".replace("'", " ")
 
 
 def test_a_longer_context_is_shown() -> None:

@@ -342,6 +342,7 @@ def test_history_for_a_late_joiner_says_nothing_of_the_link(tmp_path: Path) -> N
     fitted = tmp_path / "fitted.yaml"
     done = CliRunner().invoke(cli, ["fit", str(tmp_path / "native.mcap"), "-o", str(fitted)])
     assert "left out 1 message sent before the subscription was created" in done.output
+    assert done.output.count("measured fewer than 30 times") == 1, "one note, not one for each"
 
 
 @pytest.mark.long

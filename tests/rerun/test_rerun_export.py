@@ -190,6 +190,9 @@ def test_the_layout_is_in_the_file(recording: Recording) -> None:
     assert recording.views >= {
         *("3D", "2D", "TimeSeries", "StateTimeline", "TextLog", "Dataframe", "Map")
     }
+    plots = set(recording.view_names.values())
+    assert "/scan" not in plots, "it is drawn; its limits are no curves"
+    assert "/voltage" in plots
 
 
 @pytest.mark.long

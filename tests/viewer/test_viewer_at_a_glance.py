@@ -127,6 +127,7 @@ def test_the_overview_says_how_long_callbacks_took_and_what_was_lost(tmp_path: P
             if place == 1:
                 feeder.output(OutputKind.DRAW, publisher, encode_decision(RandomDecision.BURST))
             feeder.event(EventKind.TIMER, timer, 10_000_000 * place)
+        feeder.event(EventKind.TASK, timer, 20_000_000)
         feeder.writer.close(result={"stop_reason": "done", "exit_code": "0"})
     run = Run.open(path)
     overview = list(read_overview(run))[-1]
@@ -135,6 +136,8 @@ def test_the_overview_says_how_long_callbacks_took_and_what_was_lost(tmp_path: P
     assert overview.sent == {}
     (callback,) = callbacks_of(run, overview)
     assert callback.took == overview.took[timer]
+    assert (callback.count, callback.rate_hz) == (4, 100)  # what goes on is no further start
+    assert callback.rate_hz == count_trace(run.trace).rate_hz(timer)
     assert callback.share == pytest.approx(9 / 20)
     assert nodes_of(run, overview)[0].share == callback.share
     assert any("lost" in one.what for one in troubles_of(run, overview, None))

@@ -70,6 +70,11 @@ def test_names_are_cut_where_they_stay_distinct() -> None:
     alike = ShortNames(f"/warehouse_fleet_{n}_controller_of_all_wheels" for n in ("east", "west"))
     shown = [alike.fit(name, 16) for name in alike._names]
     assert shown == ["…leet_east_cont…", "…leet_west_cont…"]
+    actions = [
+        f"/{robot}/drive/{part}" for robot in ("robot_1", "robot_2") for part in ("goal", "status")
+    ]
+    of_actions = ShortNames(actions)  # all look alike at the beginning, two at the end
+    assert [of_actions.fit(name, 8) for name in actions[:2]] == ["/ro…goal", "/ro…atus"]
     assert names.fit("/a", 5) == "/a   "
     assert names.fit("/not/one/of/them", 8) == "/not/on…"
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.diff.why.answer import why
+from rsltrace.diff.why.answer import evidence, sentence, why
 from rsltrace.diff.why.filters import _spread
 from rsltrace.errors import TraceError
 from rsltrace.job import load_job
@@ -35,6 +35,61 @@ def test_an_exception_of_several_lines_keeps_its_type_and_message() -> None:
     frame = '  File "a.py", line 3, in tick\n    raise ValueError(text)\n    ^^^^^\n'
     text = f"Traceback (most recent call last):\n{frame}ValueError: bad\n second line"
     assert exception_of(text) == "ValueError: bad second line"
+
+
+@pytest.fixture
+def two_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run of two robots of one name, of which the second sends the first a goal each 0.1 s."""
+    (tmp_path / "robots.py").write_text(
+        "from rclpy.action import ActionClient, ActionServer\n"
+        "from rclpy.node import Node\n"
+        "from test_msgs.action import Fibonacci\n"
+        "class Robot(Node):\n"
+        "    def __init__(self, **keywords):\n"
+        "        super().__init__('mover', **keywords)\n"
+        "        if self.get_namespace() == '/one':\n"
+        "            self.server = ActionServer(self, Fibonacci, 'drive', self.drive)\n"
+        "        else:\n"
+        "            self.client_ = ActionClient(self, Fibonacci, '/one/drive')\n"
+        "            self.create_timer(0.1, self.tick)\n"
+        "    def drive(self, goal):\n"
+        "        goal.succeed()\n"
+        "        return Fibonacci.Result()\n"
+        "    def tick(self):\n"
+        "        self.client_.send_goal_async(Fibonacci.Goal()).add_done_callback(id)\n"
+    )
+    (tmp_path / "job.yaml").write_text(
+        "nodes:\n"
+        "  - {node: robots:Robot, namespace: /one}\n"
+        "  - {node: robots:Robot, namespace: /two}\n"
+        "stop: {duration: 1s}\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    run(load_job("job.yaml"), "run.mcap")
+    return tmp_path / "run.mcap"
+
+
+@pytest.mark.ros
+def test_a_name_may_be_relative_and_is_never_guessed(two_robots: Path) -> None:
+    with Trace.open(two_robots) as trace:
+        with pytest.raises(TraceError, match="'mover' matches /one/mover, /two/mover: give the"):
+            why(trace, "mover", "drive")
+        with pytest.raises(
+            TraceError, match=r"several drive; .*\(service /one/drive/_action/c.*l\)"
+        ):
+            why(trace, "/one/mover", "drive")
+        assert why(trace, "/one/mover", "send_goal").question.entity.name.endswith("/send_goal")
+
+
+@pytest.mark.ros
+def test_a_goal_is_counted_once_and_up_to_the_time_asked_about(two_robots: Path) -> None:
+    with Trace.open(two_robots) as trace:
+        for node, by in (("/one/mover", "client"), ("/two/mover", "service")):
+            reason = why(trace, node, "/one/drive/_action/send_goal", 350_000_000)
+            assert "ran as expected, 3 times, last at 0.3 s" in sentence(reason)
+            sent = next(evidence(reason))
+            assert sent.startswith(f"sent: 3 by {by} ")
+            assert sent.endswith("received: 3")
 
 
 @pytest.mark.ros

@@ -6,7 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
+from rsltrace.trace.model.texts import (
+    counted,
+    format_duration,
+    format_seconds,
+    printable,
+    shortened,
+)
 from rsltrace.trace.words.entities import flag_names
 
 if TYPE_CHECKING:
@@ -108,9 +114,8 @@ def queue_lines(queues: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     full = [one for one in queues if one.get("waiting")]
     if full:
         yield from _table(full)
-    empty = len(queues) - len(full)
     where = "nothing waits in the other" if full else "nothing waits in"
-    yield f"{where} {empty} queue{'s' * (empty != 1)}"
+    yield f"{where} {counted(len(queues) - len(full), 'queue')}"
 
 
 def graph_lines(graph: Mapping[str, Any]) -> Iterator[str]:

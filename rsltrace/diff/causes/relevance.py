@@ -210,8 +210,8 @@ class Relevance:
             for count in trace.guarded
             if count.source is NondeterminismSource.RANDOM
         }
-        drawing |= {  # rclpy draws the ids of an action client's goals
-            trace.entities.get(entity.node, entity).name
+        drawing |= {  # rclpy, whose calls are not counted, draws the ids of goals
+            trace.node_of(entity).name
             for trace in self._traces
             for entity in trace.entities.values()
             if entity.kind is EntityKind.CLIENT and "action" in entity.detail

@@ -8,7 +8,7 @@ from rsltrace.diff.facts.evidence import ULP_SHOWN_MAX, FieldDifference, Message
 from rsltrace.diff.report.line import Line, Piece, Style, cut, in_columns, line, wrapped
 from rsltrace.diff.sentences.values import notes_text, output_change_text
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.texts import printable, shortened
+from rsltrace.trace.model.texts import counted, printable, shortened
 from rsltrace.trace.words.code import places_text
 
 _INDENT = "    "
@@ -80,7 +80,7 @@ def payload_lines(
     or the reason why nothing can be said."""
     rows = _field_lines(fields, width)
     if more_fields:
-        rows.append(line((f"{_INDENT}… {more_fields} more fields", Style.FAINT)))
+        rows.append(line((f"{_INDENT}… {counted(more_fields, 'more field')}", Style.FAINT)))
     if preview:
         rows.append(line(f"{_INDENT}{shortened(printable(preview), width - len(_INDENT))}"))
     if reason:

@@ -12,7 +12,7 @@ from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.several import COLUMNS, how_all_agree, how_many_fail, several_cells
 from rsltrace.diff.report.text import report_lines
 from rsltrace.diff.result import BagDiff, Diff
-from rsltrace.trace.model.texts import printable, shortened
+from rsltrace.trace.model.texts import counted, printable, shortened
 from rsltrace.trace.words.phrases import as_sentence
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#~@])")
@@ -89,7 +89,7 @@ def _fields(diff: Diff | BagDiff) -> list[str]:
         more += len(fields) - len(rows)
         lines += [f"**{_escaped(title)}**", "", *_table(("field", "a", "b", ""), rows), ""]
         if more:
-            lines += [f"… {more} more fields", ""]
+            lines += [f"… {counted(more, 'more field')}", ""]
     return lines
 
 

@@ -25,7 +25,7 @@ from rsltrace.diff.sentences.divergence import phrase, sentence_of
 from rsltrace.diff.sentences.values import IN_ONE, field_text, listed, output_change_text, pair_text
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.operation import PARAMETER_EVENTS
-from rsltrace.trace.model.texts import printable, shortened
+from rsltrace.trace.model.texts import counted, printable, shortened
 from rsltrace.trace.words.phrases import at_time
 
 _VALUE_MAX = 40
@@ -82,7 +82,7 @@ def effect_text(found: Judgement) -> str:
     who = one.node or (f"{one.entity.kind} {one.entity.name}" if one.entity.name else "the run")
     is_made = one.kind is EventKind.CONSTRUCT
     when = "in its constructor" if is_made else at_time(one.stamp_ns)
-    more = f" and {len(sent) - 1} more" if len(sent) > 1 else ""
+    more = f" and {counted(len(sent) - 1, 'more output')}" if len(sent) > 1 else ""
     return f"{who} {_done(message)} {when}{f' ({values})' if values else ''}{more}"
 
 
@@ -91,12 +91,9 @@ def _done(message: MessageDifference) -> str:
     if message.fate is not None or message.presence is not Presence.BOTH:
         what = output_change_text(message) or IN_ONE[message.presence]
         return f"{verb} {on}{message.topic} {what}"
-    fields = message.fields
     other = "message" if message.kind is OutputKind.MESSAGE else "content"
-    if fields:
-        more = len(fields) - 1 + message.more_fields
-        other = fields[0].path
-        other += f" and {more} more field{'s' if more > 1 else ''}" if more else ""
+    if message.fields:
+        other = message.fields[0].path
     if message.kind is OutputKind.MESSAGE:
         return f"published a different {other} on {message.topic}"
     return f"{verb} {message.topic} with a different {other}"

@@ -31,6 +31,7 @@ from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import (
     contrasting_durations,
     contrasting_texts,
+    counted,
     format_duration,
     printable,
     shortened,
@@ -123,7 +124,7 @@ def field_text(fields: Sequence[FieldDifference], more_fields: int) -> str:
         named = first.note_of(FieldNoteKind.CONSTANTS, FieldNoteKind.SAME_WORDS)
         text += f" ({note_text(named)})" if named else ""
     more = len(fields) - 1 + more_fields
-    return f"{text} and {more} more field{'s' if more > 1 else ''}" if more else text
+    return f"{text} and {counted(more, 'more field')}" if more else text
 
 
 def note_text(note: FieldNote) -> str:

@@ -65,15 +65,25 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
             raise TraceError(printable(text))
         reason = None if nearest(node, known) else _not_begun(history, node)
         return reason or _fail(trace, "node", node, known)
+    if len(set(called)) > 1:
+        text = f"{node!r} matches {', '.join(dict.fromkeys(called))}: give the full name"
+        raise TraceError(printable(text))
     own = [one for one in nodes if one.name == called[0]]
     ids = {one.id for one in own}
     there = [e for e in trace.entities.values() if e.node in ids and e.kind in WITH_CALLBACK]
     if not asked:
         listed = ", ".join(dict.fromkeys(_names_of(there))) or "none"
         raise TraceError(printable(f"name a topic or callback of {called[0]}; there are {listed}"))
+    topic = f"/{asked.lstrip('/')}"
+    is_topic = any(e.name == topic and e.kind in _NAMED for e in trace.entities.values())
     found = [one for one in there if _is_meant(one, asked)]
+    if not (found or is_topic or asked.startswith("/")):  # a name in the namespace of the node
+        found = [one for one in there if f"{topic}/" in f"{one.name}/"]
     if len({filter_of(e) or (e.kind, e.name, e.detail.get("callback")) for e in found}) > 1:
-        listed = ", ".join(f"{e.id} ({e.kind.label} {e.name}: {_callbacks(e)[-1]})" for e in found)
+        titles = [": ".join(dict.fromkeys((e.name, _callbacks(e)[-1]))) for e in found]
+        listed = ", ".join(
+            f"{e.id} ({e.kind.label} {title})" for e, title in zip(found, titles, strict=True)
+        )
         text = f"{called[0]} has several {asked}; give a number: {listed}"
         raise TraceError(printable(text))
     if found:
@@ -86,8 +96,7 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
         return NotConstructed(*what, question=question, place=raised[1], event=event)
     there = [one for one in there if not is_built_in(one)]
     received = [one for one in there if one.kind in SENDERS]
-    topic = f"/{asked.lstrip('/')}"
-    if any(one.name == topic and one.kind in _NAMED for one in trace.entities.values()):
+    if is_topic:
         last = topic.rpartition("/")[2]
         near = [one for one in received if one.name.rpartition("/")[2] == last] or received
         names = tuple(printable(one.name) for one in near)
@@ -355,8 +364,9 @@ def evidence(reason: Reason) -> Iterator[str]:
 
 def _evidence(reason: Reason) -> Iterator[str]:
     question, history = reason.question, reason.question.history
-    if messages := question.messages:
-        taken = sum(one.taken is not None for one in messages)
+    if messages := [one for one in question.messages if one.sent_ns <= question.time_ns]:
+        by = [history.stamp(one.taken) for one in messages if one.taken is not None]
+        taken = sum(stamp <= question.time_ns for stamp in by)
         counts = Counter(one.sender for one in messages).items()
         senders = ", ".join(f"{number} by {question.named(one)}" for one, number in counts)
         yield f"sent: {senders}; received: {taken}"

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.trace.contents import CONTINUES
 from rsltrace.trace.departures import Departures
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
@@ -96,7 +97,7 @@ class RunHistory:
     def calls_of(self, entity: int, until_ns: int = _FOR_EVER) -> list[int]:
         """Return the events with which an entity's callback began, until a time."""
         mine = self.events[: self.ended]
-        began = (mine["entity"] == entity) & (mine["kind"] != EventKind.RESUME)
+        began = (mine["entity"] == entity) & ~np.isin(mine["kind"], CONTINUES)
         found: list[int] = np.flatnonzero(began & (mine["stamp"] <= until_ns)).tolist()
         return found
 

@@ -15,7 +15,7 @@ from rsltrace.checks.latency.instances import Durations
 from rsltrace.job import Job
 from rsltrace.native.fit.measurement import CallbackDurations, LinkTimes, NativeTimes
 from rsltrace.native.fit.models import FEW, DurationModel, as_job_has_it, model_of, series_of
-from rsltrace.trace.model.texts import format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import counted, format_duration, format_seconds, printable
 
 _UNITS = ((1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"))
 TABLES, DISTRIBUTIONS, SERIES = ("tables", "distributions", "series")
@@ -183,6 +183,12 @@ def notes(fit: Fit, job: Job) -> Iterator[str]:
         )
     for one in found.executions:
         yield from _of_execution(one)
+    counts = [len(one.delays) for one in found.links] + [len(one.busy) for one in found.executions]
+    if few := sum(0 < count < FEW for count in counts):
+        yield (
+            f"{few} of the {len(counts)} delays and execution times were measured fewer than {FEW} "
+            "times, which says little of the tail"
+        )
     tied = [(one.tied, one) for one, model in fit.executions if not model.points]
     for by, one in tied:
         if len(one.busy) >= FEW and by > _TIED:
@@ -213,16 +219,14 @@ def _of_link(link: LinkTimes) -> Iterator[str]:
         )
     if link.history:
         yield (
-            f"{link}: left out {_counted(link.history, 'message')} sent before the subscription "
+            f"{link}: left out {counted(link.history, 'message')} sent before the subscription "
             "was created (history of a late joiner)"
         )
     if not len(link.delays):
         yield f"{link}: no delay is known; it is without delay"
-    elif len(link.delays) < FEW:
-        yield f"{link}: only {_counted(len(link.delays), 'message')}, which say little of the tail"
     if link.missing:
         yield (
-            f"{link}: {_counted(link.missing, 'message')} did not arrive, lost or pushed out of a "
+            f"{link}: {counted(link.missing, 'message')} did not arrive, lost or pushed out of a "
             "queue; the fitted job loses none on the way (see drop: in docs/delays.md)"
         )
 
@@ -230,8 +234,6 @@ def _of_link(link: LinkTimes) -> Iterator[str]:
 def _of_execution(one: CallbackDurations) -> Iterator[str]:
     name = f"{one.node}: {one.kind} {one.entity}"
     count = len(one.busy)
-    if count < FEW:
-        yield f"{name}: only {_counted(count, 'run')}, which say little of the tail"
     if one.parts:
         yield (
             f"{name}: {one.parts} of {count} runs awaited something, and the simulation takes time "
@@ -245,10 +247,6 @@ def _of_execution(one: CallbackDurations) -> Iterator[str]:
             f"{name}: what it sends leaves {format_duration(one.tail_ns)} (median) before its end, "
             "in the simulation at its end"
         )
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 # What was measured and what a simulation draws, as a picture: shares of values below a time.

@@ -71,16 +71,16 @@ def format_duration(duration_ns: float, digits: int = _DIGITS, *, signed: bool =
     return f"{round(rounded):{sign}d} ns"
 
 
-def counted(count: int, what: str) -> str:
-    """Return a number of things."""
-    return f"{count:,} {what}{'s' * (count != 1)}"
-
-
 def format_milliseconds(duration_ns: int | None) -> str:
     """Return a duration for a column in milliseconds."""
     if duration_ns is None:
         return "-"
     return f"{duration_ns / 1e6:.{4 if abs(duration_ns) < 10 * NS_PER_S else 9}g}"
+
+
+def counted(count: int, what: str) -> str:
+    """Return a number of things: ``1 run``, ``2,000 runs``."""
+    return f"{count:,} {what}{'s' * (count != 1)}"
 
 
 def contrasting(a: Any, b: Any, text: Callable[[Any, int], Text]) -> tuple[Text, Text]:

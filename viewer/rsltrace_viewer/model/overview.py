@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rsltrace.errors import RsltraceError, TraceError
 from rsltrace.fast_dataclass import dataclass
-from rsltrace.trace.contents import Occurrences, add_occurrences
+from rsltrace.trace.contents import CONTINUES, Occurrences, add_occurrences
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import (
     EventFlag,
@@ -77,12 +77,13 @@ class Met:
 class Overview:
     """Counts of a run, so far: ``share`` of it is read (0 to 1). Keys are ids of entities.
 
-    ``sent`` counts the messages of publishers, ``waited`` is how long messages were on their way,
-    ``took`` how long callbacks took, where the job gives them execution times, ``paused`` how long
-    they waited themselves, in a call or a sleep.
+    ``starts`` are events in which callbacks begin, ``sent`` counts the messages of publishers,
+    ``waited`` is how long messages were on their way, ``took`` how long callbacks took, where the
+    job gives them execution times, ``paused`` how long they waited themselves.
     """
 
     events: dict[int, Occurrences] = field(default_factory=dict)
+    starts: dict[int, Occurrences] = field(default_factory=dict)
     sent: dict[int, Occurrences] = field(default_factory=dict)
     waited: dict[int, Times] = field(default_factory=dict)
     took: dict[int, Times] = field(default_factory=dict)
@@ -106,6 +107,8 @@ def read_overview(run: Run) -> Iterator[Overview]:
             continue
         events, stamps = segment.events, segment.events["stamp"]
         add_occurrences(found.events, events["entity"], stamps)
+        starts = ~np.isin(events["kind"], CONTINUES)
+        add_occurrences(found.starts, events["entity"][starts], stamps[starts])
         draws = outputs[outputs["kind"] == _DRAW]
         sent = outputs[~np.isin(outputs["kind"], _NOT_SENT)]
         places = (sent["event"] - np.uint64(segment.first)).astype(np.intp)
@@ -215,7 +218,7 @@ def callbacks_of(run: Run, overview: Overview) -> list[OverviewSection]:
                 found.kind.label,
                 run.node_name(entity),
                 series.count,
-                series.rate_hz,
+                overview.starts.get(entity, series).rate_hz,
                 (took.total_ns if overview.took else series.count) / whole,
                 overview.waited.get(entity) if found.kind in _RECEIVERS else None,
                 took if overview.took else None,

@@ -16,7 +16,7 @@ from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, OutputKind
 from rsltrace.trace.model.operation import NODE_TOPICS
-from rsltrace.trace.model.texts import PLACEHOLDERS
+from rsltrace.trace.model.texts import PLACEHOLDERS, counted
 from rsltrace_viewer.model.chains import ARROW, VIA
 from rsltrace_viewer.model.run import Run
 
@@ -206,7 +206,7 @@ def _field_series(run: Run, source: PlotSource) -> Iterator[Series]:
         return
     count = trace.message_counts.get(channel.id, 0)
     step = max(-(-count // SAMPLES_MAX), 1)
-    note = f"one in {step} of {count:,} messages" if step > 1 else f"{count:,} messages"
+    note = f"one in {step} of {count:,} messages" if step > 1 else counted(count, "message")
     times, values = [], []
     for sequence in range(0, count, step):
         stamp_ns, data = trace.message(channel.id, sequence)
@@ -279,7 +279,7 @@ def _latency_series(run: Run, topic: str, node: str) -> Iterator[Series]:
             share = f"{(number + 1) / len(run.segments):.0%} read"
             yield Series(np.concatenate(times), np.concatenate(values), share)
     if times:
-        yield Series(np.concatenate(times), np.concatenate(values), f"{total:,} messages")
+        yield Series(np.concatenate(times), np.concatenate(values), counted(total, "message"))
     else:
         yield Series(_NO_POINTS, _NO_POINTS)
 

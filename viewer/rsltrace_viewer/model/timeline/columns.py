@@ -252,7 +252,7 @@ def layout(space: ListSpace, names: Mapping[str, ShortNames]) -> ColumnLayout:
 
 
 # A set of names often shares a namespace at the beginning and a kind of sensor at the end. Cut at
-# the end they may all look the same. So each is cut where it leaves a form that no other one has.
+# the end they may all look the same. So each is cut where it leaves a form that fewest others have.
 
 
 class ShortNames:
@@ -274,12 +274,13 @@ class ShortNames:
     def _cut(self, width: int) -> dict[str, str]:
         """Return the cut form of all names that are longer than ``width``."""
         chosen: dict[str, str] = {}
+        alike: dict[str, int] = {}
         for cut in (fit, _in_the_middle, _at_the_start, self._where_it_differs):
             forms = {name: cut(name, width) for name in self._names}
             count = Counter(forms.values())
             for name, form in forms.items():
-                if cells(name) > width and name not in chosen and count[form] == 1:
-                    chosen[name] = form
+                if cells(name) > width and count[form] < alike.get(name, len(forms) + 1):
+                    chosen[name], alike[name] = form, count[form]
         return chosen
 
     def _where_it_differs(self, name: str, width: int) -> str:

@@ -238,8 +238,9 @@ class MessageRows:
                     self._markers.log(rows.path, message, stamp_ns, event)
                 continue
             steps = is_command(rows.topic, type_name)
-            yield from self._curves(rows, curves_of(messages), steps=steps)
             draw = SHAPES.get(type_name)
+            curves = (one for one in curves_of(messages) if one.path or draw is None)
+            yield from self._curves(rows, curves, steps=steps)  # no limits of a scan
             if draw is not None:
                 yield from self._draw(rows, draw(messages, self._paint(rows.topic)), messages)
         translations = by_name.get("InstancePoses3D:translations")
